@@ -1,0 +1,1 @@
+"""MCAP bags: write, read, recover, inspect; no rclpy."""

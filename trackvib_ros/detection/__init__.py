@@ -1,0 +1,1 @@
+"""Train detection on streams of waveform blocks: pure NumPy and SciPy."""
