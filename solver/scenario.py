@@ -319,15 +319,13 @@ class Train(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Train:
-        for car, follower in zip(self.vehicles, self.vehicles[1:] + (None,), strict=True):
+        for car, follower in zip(self.vehicles, (*self.vehicles[1:], None), strict=True):
             if isinstance(car, Car) and car.shared_rear_bogie and not isinstance(follower, Car):
                 raise ValueError("a car with shared_rear_bogie must be followed by a car")
         wheelsets = len(self.axle_positions)
-        for defect in (*self.flat, *self.polygon):
-            if defect.wheelset > wheelsets:
-                raise ValueError(
-                    f"wheelset = {defect.wheelset} has a defect, but the train has {wheelsets}"
-                )
+        for number in [flat.wheelset for flat in self.flat] + [p.wheelset for p in self.polygon]:
+            if number > wheelsets:
+                raise ValueError(f"wheelset = {number} has a defect, but the train has {wheelsets}")
         return self
 
     @property
@@ -442,21 +440,15 @@ class Irregularity(Section):
 
     @model_validator(mode="after")
     def _one_kind(self) -> Irregularity:
-        given = [
-            name
-            for name in ("spectrum", "profile", "components")
-            if getattr(self, name) is not None
-        ]
+        kinds = ("spectrum", "profile", "components")
+        given = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(given) > 1:
+            raise ValueError(f"state one of {', '.join(kinds)}, not {' and '.join(given)}")
+        shortest, longest = self.wavelength_min, self.wavelength_max
+        if shortest and longest and shortest >= longest:
             raise ValueError(
-                f"state one of spectrum, profile, components, not {' and '.join(given)}"
+                f"wavelength_min = {shortest} m must be less than wavelength_max = {longest} m"
             )
-        if self.wavelength_min and self.wavelength_max:
-            if self.wavelength_min >= self.wavelength_max:
-                raise ValueError(
-                    f"wavelength_min = {self.wavelength_min} m must be less than "
-                    f"wavelength_max = {self.wavelength_max} m"
-                )
         return self
 
 
@@ -621,7 +613,8 @@ class Scenario(Section):
 
 def _preset_table(file: str) -> dict[str, Any]:
     text = resources.files("solver.presets").joinpath(file).read_text(encoding="utf-8")
-    return tomllib.loads(text)
+    table: dict[str, Any] = tomllib.loads(text)
+    return table
 
 
 def preset_names() -> dict[str, list[str]]:
