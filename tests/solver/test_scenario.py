@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def test_articulated_set_shares_bogies_and_has_the_published_length() -> None:
     assert len(axles) == 26
     assert train.length == pytest.approx(200.19, abs=1e-9)
     centres = [(a + b) / 2 for a, b in zip(axles[::2], axles[1::2], strict=True)]
-    spacings = [b - a for a, b in zip(centres, centres[1:], strict=False)]
+    spacings = [b - a for a, b in itertools.pairwise(centres)]
     assert spacings[2:-2] == pytest.approx([18.7] * 8)
     assert spacings[0] == spacings[-1] == pytest.approx(14.0)
     assert all(b - a == pytest.approx(3.0) for a, b in zip(axles[::2], axles[1::2], strict=True))
