@@ -1,6 +1,8 @@
 """Vehicle-track-bridge dynamics: hierarchical-beam FE extended to 5 kHz by SEA. No ROS here."""
 
 from .errors import InputError, SolverError
+from .motion import TrainMotion
+from .quality import QualityReport
 from .scenario import (
     GRAVITY,
     Scenario,
@@ -12,12 +14,17 @@ from .scenario import (
     scenario_schema,
     train_preset,
 )
+from .simulation import Block, Simulation
 
 __all__ = [
     "GRAVITY",
+    "Block",
     "InputError",
+    "QualityReport",
     "Scenario",
+    "Simulation",
     "SolverError",
+    "TrainMotion",
     "build_scenario",
     "load_scenario",
     "load_scenario_text",

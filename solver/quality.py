@@ -1,0 +1,27 @@
+"""What a run says about its own trustworthiness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class QualityReport:
+    """Quality of the samples computed so far.
+
+    Attributes:
+        samples: number of samples.
+        equilibrium_residual: largest |F - law(compression)| over all wheelsets and steps, divided
+            by the static wheelset load (-).
+        energy_residual: |work done - stored - dissipated| / work done (-); None if not computed.
+        lost_contacts: number of times a wheelset lifted off on the line.
+        valid_band: highest trustworthy frequency of every channel (Hz).
+        notes: sentences on what limits the result.
+    """
+
+    samples: int
+    equilibrium_residual: float
+    energy_residual: float | None
+    lost_contacts: int
+    valid_band: dict[str, float]
+    notes: tuple[str, ...] = field(default=())
