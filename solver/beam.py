@@ -1,0 +1,231 @@
+"""The hierarchical beam element (Eq. 1) in a well-conditioned, conforming basis.
+
+An element carries four nodal functions (deflection and rotation at both ends) and ``n``
+hierarchical functions that vanish, with their rotation, at both ends; so elements join
+continuously in deflection and rotation whatever their ``n``.
+
+* Euler-Bernoulli: exactly the space of Eq. (1), cubic Hermite plus ``sin(j pi x / l)``,
+  ``j = 1 .. n``. The sines are reduced by the cubics with their end slopes and then made
+  orthonormal in the mass (eigenvectors of the clamped element); raw, Eq. (1) is nearly linearly
+  dependent (condition number of the mass matrix 1e13 for 32 sines on 72 m).
+* Timoshenko: deflection ``w`` and rotation ``theta`` of the section. The nodal functions are the
+  exact static shapes (shear angle constant in the element, hence no locking); the hierarchical
+  ones are the ``n`` lowest modes of the clamped element (component modes; Hurty 1965, Craig and
+  Bampton 1968), computed once per length in integrated Legendre polynomials.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from .errors import SolverError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BeamSection:
+    """Properties of a beam per length.
+
+    Attributes:
+        bending_stiffness: EI (N*m^2).
+        mass_per_length: m (kg/m).
+        shear_stiffness: kappa G A (N); ``None`` is an Euler-Bernoulli beam.
+        rotary_inertia: rho I (kg*m); 0 for an Euler-Bernoulli beam.
+    """
+
+    bending_stiffness: float
+    mass_per_length: float
+    shear_stiffness: float | None = None
+    rotary_inertia: float = 0.0
+
+    def wavenumber(self, frequency: float) -> float:
+        """Free wavenumber of bending waves (rad/m) at ``frequency`` (Hz).
+
+        The larger real root of
+        ``EI k^4 - (rho I w^2 + EI m w^2 / kGA) k^2 - m w^2 (1 - rho I w^2 / kGA) = 0``.
+        """
+        w2 = (2 * math.pi * frequency) ** 2
+        a, m, r = self.bending_stiffness, self.mass_per_length, self.rotary_inertia
+        s = 0.0 if self.shear_stiffness is None else 1 / self.shear_stiffness
+        half = (r * w2 + a * m * w2 * s) / (2 * a)
+        return math.sqrt(half + math.sqrt(half * half + m * w2 * (1 - r * w2 * s) / a))
+
+    def frequency(self, wavenumber: float) -> float:
+        """Frequency (Hz) of the bending wave of ``wavenumber`` (rad/m)."""
+        k2 = wavenumber**2
+        a, m, r = self.bending_stiffness, self.mass_per_length, self.rotary_inertia
+        if self.shear_stiffness is None:
+            return k2 * math.sqrt(a / m) / (2 * math.pi)
+        s = self.shear_stiffness
+        b = s * m + (m * a + s * r) * k2
+        w2 = 2 * s * a * k2 * k2 / (b + math.sqrt(b * b - 4 * m * r * s * a * k2 * k2))
+        return math.sqrt(w2) / (2 * math.pi)
+
+
+Family = Literal["sines", "legendre"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Element:
+    """Shape functions of one element: columns 0-3 nodal (w, rotation left; right), then ``n``.
+
+    Attributes:
+        length: l (m).
+        family: what the coefficients multiply: cubic Hermite and sines, or Legendre polynomials.
+        deflection_coefficients: (primitives, 4 + n).
+        rotation_coefficients: the same for the rotation; ``None`` when it is the slope.
+        internal_frequencies: (n,) natural frequencies of the clamped element (Hz).
+    """
+
+    length: float
+    family: Family
+    deflection_coefficients: Array
+    rotation_coefficients: Array | None
+    internal_frequencies: Array
+
+    @property
+    def functions(self) -> int:
+        """Number of shape functions, 4 + n."""
+        return int(self.deflection_coefficients.shape[1])
+
+    def deflection(self, x: Array, derivative: int = 0) -> Array:
+        """Derivative of the deflection shapes at ``x`` (m from the left node): (len(x), 4 + n)."""
+        p = _primitives(self.family, len(self.deflection_coefficients), x / self.length, derivative)
+        return np.asarray(p @ self.deflection_coefficients / self.length**derivative)
+
+    def rotation(self, x: Array, derivative: int = 0) -> Array:
+        """Derivative of the rotation shapes at ``x`` (m from the left node): (len(x), 4 + n)."""
+        if self.rotation_coefficients is None:
+            return self.deflection(x, derivative + 1)
+        p = _primitives(self.family, len(self.rotation_coefficients), x / self.length, derivative)
+        return np.asarray(p @ self.rotation_coefficients / self.length**derivative)
+
+
+def _primitives(family: Family, count: int, s: Array, derivative: int) -> Array:
+    """Primitive functions of s = x/l in [0, 1] and their derivatives with respect to s."""
+    if family == "legendre":
+        identity = np.eye(count)
+        series = np.polynomial.legendre.legder(identity, derivative) * 2.0**derivative
+        vander = np.polynomial.legendre.legvander(2 * s - 1, max(len(series) - 1, 0))
+        return np.asarray(vander @ series)
+    values = np.empty((len(s), count))
+    hermite = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 3, -2], [0, 0, -1, 1]], float)
+    for column, polynomial in enumerate(hermite):
+        values[:, column] = np.polynomial.polynomial.polyval(
+            s, np.polynomial.polynomial.polyder(polynomial, derivative)
+        )
+    order = np.pi * np.arange(1, count - 3)
+    values[:, 4:] = order**derivative * np.sin(np.outer(s, order) + derivative * np.pi / 2)
+    return values
+
+
+@lru_cache(maxsize=512)
+def beam_element(length: float, section: BeamSection, hierarchical: int) -> Element:
+    """Element of ``length`` (m) with ``hierarchical`` internal functions.
+
+    Raises:
+        SolverError: the element's own eigenproblem is not positive definite.
+    """
+    try:
+        if section.shear_stiffness is None:
+            return _euler_bernoulli(length, section, hierarchical)
+        return _timoshenko(length, section, hierarchical)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(
+            f"beam element of {length:g} m: mass of its {hierarchical} hierarchical functions is "
+            f"not positive definite in double precision ({error}); use fewer"
+        ) from None
+
+
+def _euler_bernoulli(length: float, section: BeamSection, n: int) -> Element:
+    order = np.pi * np.arange(1, n + 1)
+    reduce = np.zeros((4 + n, n))
+    reduce[1] = -order
+    reduce[3] = -order * np.cos(order)
+    reduce[4:] = np.eye(n)
+    points, weights = np.polynomial.legendre.leggauss(2 * n + 12)
+    s, weights = (points + 1) / 2, weights / 2
+    shapes = _primitives("sines", 4 + n, s, 0) @ reduce
+    curvatures = _primitives("sines", 4 + n, s, 2) @ reduce
+    mass = shapes.T @ (weights[:, None] * shapes) * length * section.mass_per_length
+    stiff = curvatures.T @ (weights[:, None] * curvatures) / length**3 * section.bending_stiffness
+    coefficients = np.zeros((4 + n, 4 + n))
+    coefficients[:4, :4] = np.diag([1.0, length, 1.0, length])
+    squared = np.zeros(0)
+    if n:
+        squared, vectors = scipy.linalg.eigh(stiff, mass)
+        coefficients[:, 4:] = reduce @ vectors
+    return Element(length, "sines", coefficients, None, np.sqrt(squared) / (2 * np.pi))
+
+
+def _timoshenko(length: float, section: BeamSection, n: int) -> Element:
+    assert section.shear_stiffness is not None
+    bubbles = 2 * n + 10
+    size = bubbles + 2
+    legendre = np.polynomial.legendre
+    # bubble_j = (P_{j+2} - P_j) / sqrt(2 (2j + 3)) vanishes at both ends
+    bubble = np.zeros((size, bubbles))
+    j = np.arange(bubbles)
+    bubble[j + 2, j] = 1 / np.sqrt(2 * (2 * j + 3))
+    bubble[j, j] = -bubble[j + 2, j]
+    points, weights = legendre.leggauss(size + 1)
+    s, weights = (points + 1) / 2, weights / 2 * length
+    value = _primitives("legendre", size, s, 0) @ bubble
+    slope = _primitives("legendre", size, s, 1) @ bubble / length
+    zero = np.zeros_like(value)
+    shear = np.hstack([slope, -value])
+    bending = np.hstack([zero, slope])
+    w, theta = np.hstack([value, zero]), np.hstack([zero, value])
+
+    def gram(rows: Array, factor: float) -> Array:
+        return np.asarray(rows.T @ (factor * weights[:, None] * rows))
+
+    stiff = gram(shear, section.shear_stiffness) + gram(bending, section.bending_stiffness)
+    mass = gram(w, section.mass_per_length) + gram(theta, section.rotary_inertia)
+    deflection, rotation = np.zeros((size, 4 + n)), np.zeros((size, 4 + n))
+    deflection[:, :4], rotation[:, :4] = _static_shapes(length, section, size)
+    squared = np.zeros(0)
+    if n:
+        squared, vectors = scipy.linalg.eigh(stiff, mass, subset_by_index=[0, n - 1])
+        deflection[:, 4:] = bubble @ vectors[:bubbles]
+        rotation[:, 4:] = bubble @ vectors[bubbles:]
+    return Element(length, "legendre", deflection, rotation, np.sqrt(squared) / (2 * np.pi))
+
+
+def _static_shapes(length: float, section: BeamSection, size: int) -> tuple[Array, Array]:
+    """Static shapes of a Timoshenko element (Przemieniecki 1968) in Legendre coefficients."""
+    assert section.shear_stiffness is not None
+    p = 12 * section.bending_stiffness / (section.shear_stiffness * length**2)
+    w = np.array(
+        [
+            [1 + p, -p, -3, 2],
+            [0, length * (1 + p / 2), -length * (2 + p / 2), length],
+            [0, p, 3, -2],
+            [0, -length * p / 2, -length * (1 - p / 2), length],
+        ]
+    ) / (1 + p)
+    theta = np.array(
+        [
+            [0, -6 / length, 6 / length],
+            [1 + p, -4 - p, 3],
+            [0, 6 / length, -6 / length],
+            [0, -2 + p, 3],
+        ]
+    ) / (1 + p)
+    convert = np.polynomial.Polynomial
+    deflection, rotation = np.zeros((size, 4)), np.zeros((size, 4))
+    for column in range(4):
+        for target, source in ((deflection, w), (rotation, theta)):
+            series = convert(source[column], domain=[0, 1], window=[0, 1]).convert(
+                kind=np.polynomial.Legendre, domain=[0, 1], window=[-1, 1]
+            )
+            target[: len(series.coef), column] = series.coef
+    return deflection, rotation

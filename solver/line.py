@@ -1,0 +1,539 @@
+"""The line: rail, slab, support layer and bridge assembled to M, C and K (Eq. 2).
+
+Every layer is a field on its own mesh along x; :meth:`Field.rows` gives the sparse rows that
+map the coordinates to its deflection, and every matrix is a sum of ``rows.T @ weights @ rows``:
+beams and beds by Gauss quadrature, fastenings at their x. Channels are rows too.
+
+Both rails and both pads of a row are lumped here and nowhere else: beam and fastening properties
+of one rail are doubled. Displacement is positive down, forces compress positive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.sparse as sp
+
+from .beam import Array, BeamSection, Element, beam_element
+from .errors import SolverError
+from .scenario import Channel, Layer, Scenario, Track
+
+RAILS = 2
+LAYERS: tuple[Layer, ...] = ("rail", "slab", "support_layer", "bridge")
+
+# Element sizes, resolution and the frequency up to which a layer follows the rail's limit are
+# chosen by measurement: tests/solver/test_line.py states the errors they leave.
+SLAB_ELEMENT = 4.0
+BAY_MARGIN = 1.6
+SINE_MARGIN = 1.25
+SINE_EXTRA = 4
+BRIDGE_LIMIT = 2000.0
+
+
+def beam_sections(track: Track) -> dict[Layer, BeamSection]:
+    """Sections of the four layers of the whole track (both rails)."""
+    rail = track.rail
+    shear_modulus = rail.young_modulus / (2 * (1 + rail.poisson_ratio))
+    timoshenko = rail.theory == "timoshenko"
+    mass = RAILS * rail.mass_per_length
+    return {
+        "rail": BeamSection(
+            RAILS * rail.young_modulus * rail.second_moment,
+            mass,
+            RAILS * rail.shear_coefficient * shear_modulus * rail.area if timoshenko else None,
+            mass * rail.second_moment / rail.area if timoshenko else 0.0,
+        ),
+        "slab": BeamSection(track.slab.bending_stiffness, track.slab.mass_per_length),
+        "support_layer": BeamSection(
+            track.support_layer.bending_stiffness, track.support_layer.mass_per_length
+        ),
+        "bridge": BeamSection(track.bridge.bending_stiffness, track.bridge.mass_per_length),
+    }
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Field:
+    """Deflection of one layer on its mesh.
+
+    Attributes:
+        left: (E,) left ends of the elements (m), increasing; elements do not overlap.
+        elements: the E elements.
+        dofs: per element, the coordinate of each of its functions; -1 where a support holds it.
+        size: number N of coordinates of the whole structure.
+    """
+
+    left: Array
+    elements: tuple[Element, ...]
+    dofs: tuple[np.ndarray, ...]
+    size: int
+
+    @property
+    def right(self) -> Array:
+        """(E,) right ends of the elements (m)."""
+        return self.left + np.array([element.length for element in self.elements])
+
+    def rows(self, x: Array, derivative: int = 0) -> sp.csr_array:
+        """Rows of the deflection's derivative at ``x`` (m): (len(x), N).
+
+        A row is zero where the layer is not. At a node the element on the right is taken.
+        """
+        return self._rows(x, "deflection", derivative)
+
+    def rotation_rows(self, x: Array, derivative: int = 0) -> sp.csr_array:
+        """Rows of the section's rotation (rad) and its derivatives at ``x`` (m): (len(x), N)."""
+        return self._rows(x, "rotation", derivative)
+
+    def _rows(
+        self, x: Array, what: Literal["deflection", "rotation"], derivative: int
+    ) -> sp.csr_array:
+        x = np.atleast_1d(np.asarray(x, float))
+        if not len(self.elements):
+            return sp.csr_array((len(x), self.size))
+        index = np.clip(np.searchsorted(self.left, x, side="right") - 1, 0, None)
+        local = x - self.left[index]
+        lengths = self.right - self.left
+        inside = (local > -1e-9) & (local < lengths[index] + 1e-9)
+        groups: dict[int, list[int]] = {}
+        for number in np.unique(index[inside]):
+            groups.setdefault(id(self.elements[number]), []).append(int(number))
+        rows, columns, values = [], [], []
+        for numbers in groups.values():
+            element = self.elements[numbers[0]]
+            chosen = np.flatnonzero(inside & np.isin(index, numbers))
+            at = np.clip(local[chosen], 0.0, element.length)
+            shapes = getattr(element, what)(at, derivative)
+            table = np.zeros((len(self.elements), element.functions), np.int64)
+            for number in numbers:
+                table[number] = self.dofs[number]
+            rows.append(np.repeat(chosen, element.functions))
+            columns.append(table[index[chosen]].ravel())
+            values.append(shapes.ravel())
+        if not rows:
+            return sp.csr_array((len(x), self.size))
+        row, column, value = (np.concatenate(part) for part in (rows, columns, values))
+        free = column >= 0
+        return sp.csr_array((value[free], (row[free], column[free])), shape=(len(x), self.size))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Probe:
+    """A channel that is not plain motion: ``d @ q + v @ q' + a @ q''``.
+
+    Attributes:
+        displacement_rows, velocity_rows, acceleration_rows: (1, N).
+    """
+
+    displacement_rows: sp.csr_array
+    velocity_rows: sp.csr_array
+    acceleration_rows: sp.csr_array
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """M, C and K of a line, supports eliminated, and what reads them.
+
+    Attributes:
+        scenario: what it was assembled from.
+        mass, damping, stiffness: (N, N) symmetric, in kg, N*s/m, N/m.
+        fields: the field of each layer (without ``bridge`` when there is no span).
+        dofs: number of coordinates of each layer.
+        fastenings: (R,) positions of the fastening rows (m).
+        valid_band: highest frequency (Hz) up to which each layer's mesh resolves its own
+            bending waves, at most the frequency limit.
+        supports: (S, N) rows of mass, damping and stiffness of the held bridge ends.
+    """
+
+    scenario: Scenario
+    mass: sp.csr_array
+    damping: sp.csr_array
+    stiffness: sp.csr_array
+    fields: Mapping[Layer, Field]
+    dofs: Mapping[Layer, int]
+    fastenings: Array
+    valid_band: Mapping[Layer, float]
+    supports: Mapping[int, Probe]
+
+    @property
+    def size(self) -> int:
+        """Number N of coordinates."""
+        return int(self.mass.shape[0])
+
+    @property
+    def length(self) -> float:
+        """Length of the line (m)."""
+        return self.scenario.line.length
+
+    def rows(self, layer: Layer, x: Array | float, derivative: int = 0) -> sp.csr_array:
+        """Rows of a layer's deflection (or its x-derivative) at ``x`` (m): (len(x), N)."""
+        return self.fields[layer].rows(np.atleast_1d(np.asarray(x, float)), derivative)
+
+    def rail_rows(self, x: Array | float) -> sp.csr_array:
+        """Rows of the rail's deflection at ``x`` (m): (len(x), N)."""
+        return self.rows("rail", x)
+
+    def probe(self, channel: Channel) -> Probe:
+        """Rows of a channel: motion, strain, fastening force (whole row), bearing force.
+
+        Strain is positive in tension, ``-fibre * rotation'``; forces are positive in compression.
+        """
+        x = self.scenario.channel_x(channel)
+        none = sp.csr_array((1, self.size))
+        if channel.quantity == "motion":
+            return Probe(self._at(channel.layer, x, channel.span), none, none)
+        if channel.quantity == "strain":
+            field = self.fields[channel.layer]
+            return Probe(
+                -channel.fibre * field.rotation_rows(np.array([x]), derivative=1), none, none
+            )
+        if channel.quantity == "fastening_force":
+            if not len(self.fastenings):
+                raise SolverError(
+                    f'channel "{channel.name}": fastening rows = 0 on the line; at least 1 needed'
+                )
+            nearest = float(self.fastenings[np.argmin(np.abs(self.fastenings - x))])
+            rows, stiffness, damping = _fastening_rows(self.scenario, self.fields, nearest)
+            weights = np.ones((1, rows.shape[0]))
+            return Probe(
+                sp.csr_array((weights * stiffness) @ rows),
+                sp.csr_array((weights * damping) @ rows),
+                none,
+            )
+        if not self.supports:
+            raise SolverError(f'channel "{channel.name}": spans = 0 on the line; at least 1 needed')
+        bounds = self.scenario.line.span_bounds
+        spans = range(len(bounds)) if channel.span is None else [channel.span - 1]
+        ends = [(abs(bounds[s][e] - x), 2 * s + e) for s in spans for e in (0, 1)]
+        return self.supports[min(ends)[1]]
+
+    def channel_band(self, channel: Channel) -> float:
+        """Valid band of a channel (Hz): what its layer and the rail that feeds it resolve."""
+        return min(self.valid_band["rail"], self.valid_band[channel.layer])
+
+    def _at(self, layer: Layer, x: float, span: int | None) -> sp.csr_array:
+        # the end of a span shares its x with the next span: stay on the span that was named
+        if layer == "bridge" and span is not None:
+            left, right = self.scenario.line.span_bounds[span - 1]
+            x = min(max(x, left), right - 1e-9 * (right - left))
+        return self.rows(layer, x)
+
+
+def assemble(scenario: Scenario) -> Structure:
+    """Assemble the line of a scenario.
+
+    Raises:
+        SolverError: the stiffness is singular (a part of the track is not held).
+    """
+    track, line = scenario.track, scenario.line
+    sections = beam_sections(track)
+    fastenings = _fastening_positions(scenario)
+    meshes = {layer: _nodes(scenario, layer, fastenings) for layer in LAYERS}
+    orders = {layer: _orders(scenario, layer, meshes[layer], sections[layer]) for layer in LAYERS}
+    fields, dofs, size, held = _number(scenario, meshes, orders, sections)
+
+    full: dict[str, sp.csr_array] = {
+        name: sp.csr_array((size, size)) for name in ("mass", "damping", "stiffness")
+    }
+    for layer, field in fields.items():
+        mass, stiffness = _beam_matrices(field, sections[layer])
+        full["mass"] += mass
+        full["stiffness"] += stiffness
+        if layer == "bridge":
+            full["damping"] += _rayleigh(scenario, field, sections[layer], mass, stiffness)
+    for rows, stiff, damp in _beds(scenario, fields):
+        full["stiffness"] += _gram(rows, stiff)
+        full["damping"] += _gram(rows, damp)
+    for x in fastenings:
+        rows, stiff, damp = _fastening_rows(scenario, fields, float(x))
+        full["stiffness"] += _gram(rows, stiff)
+        full["damping"] += _gram(rows, damp)
+    bearing = track.bridge.bearing_stiffness
+
+    free = np.setdiff1d(np.arange(size), held)
+    supports: dict[int, Probe] = {}
+    if "bridge" in fields:
+        for number, dof in enumerate(_bridge_ends(fields["bridge"])):
+            if bearing is None:
+                # reaction of a rigid bearing: the held row of K q + C q' + M q''
+                matrices = (full["stiffness"], full["damping"], full["mass"])
+                rows_at = [sp.csr_array(m[[dof], :][:, free]) * -1.0 for m in matrices]
+                supports[number] = Probe(*rows_at)
+            else:
+                unit = sp.csr_array(([1.0], ([0], [dof])), shape=(1, size))
+                full["stiffness"] += bearing * (unit.T @ unit)
+                none = sp.csr_array((1, len(free)))
+                supports[number] = Probe(sp.csr_array(bearing * unit[:, free]), none, none)
+
+    position = np.full(size, -1)
+    position[free] = np.arange(len(free))
+    fields = {
+        layer: Field(
+            field.left,
+            field.elements,
+            tuple(np.where(d >= 0, position[d], -1) for d in field.dofs),
+            len(free),
+        )
+        for layer, field in fields.items()
+    }
+    reduced = {name: sp.csr_array(matrix[free][:, free]) for name, matrix in full.items()}
+    return Structure(
+        scenario,
+        reduced["mass"],
+        reduced["damping"],
+        reduced["stiffness"],
+        fields,
+        {layer: int(np.isin(dofs[layer], free).sum()) for layer in fields},
+        fastenings,
+        {
+            layer: _valid_band(scenario, meshes[layer], orders[layer], sections[layer])
+            for layer in fields
+        },
+        supports,
+    )
+
+
+def _gram(rows: sp.csr_array, weights: Array) -> sp.csr_array:
+    return sp.csr_array(rows.T @ sp.diags_array(weights) @ rows)
+
+
+def _fastening_positions(scenario: Scenario) -> Array:
+    fastening = scenario.track.fastening
+    first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
+    count = math.floor((scenario.line.length - first) / fastening.spacing + 1e-9) + 1
+    return first + fastening.spacing * np.arange(max(count, 0))
+
+
+def _factor(track: Track, parameter: str, x: Array) -> Array:
+    factor = np.ones_like(x)
+    for variation in track.variation:
+        if variation.parameter == parameter:
+            factor = np.where(
+                (x >= variation.start) & (x <= variation.end), factor * variation.factor, factor
+            )
+    return factor
+
+
+def _spread(bounds: list[float], longest: float) -> list[float]:
+    """Nodes from first to last bound, none further apart than ``longest``."""
+    nodes = [bounds[0]]
+    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+        if b - a > 1e-9:
+            nodes += list(np.linspace(a, b, math.ceil((b - a) / longest - 1e-9) + 1)[1:])
+    return nodes
+
+
+def _nodes(scenario: Scenario, layer: Layer, fastenings: Array) -> list[Array]:
+    """Node positions of a layer (m), one array per connected part."""
+    line, track = scenario.line, scenario.track
+    if layer == "bridge":
+        return [np.array(bounds) for bounds in line.span_bounds]
+    ends = [0.0, line.length]
+    stops = sorted({*ends, *(x for bounds in line.span_bounds for x in bounds)})
+    if scenario.solution.sines is not None:
+        return [np.array(stops)]
+    if layer == "rail" and track.rail.theory == "timoshenko":
+        # the shear force jumps at a fastening, so the slope of the rail does too
+        inner = fastenings[
+            (fastenings > 1e-3 * track.fastening.spacing)
+            & (fastenings < line.length - 1e-3 * track.fastening.spacing)
+        ]
+        return [np.array([ends[0], *inner, ends[1]])]
+    jumps = {
+        x
+        for variation in track.variation
+        for x in (variation.start, variation.end)
+        if 0 < x < line.length and not variation.parameter.startswith("fastening")
+    }
+    stops = sorted({*stops, *jumps})
+    kept = [stops[0]]
+    for stop in stops[1:-1]:
+        if stop - kept[-1] > 0.2 and stops[-1] - stop > 0.2:
+            kept.append(stop)
+    return [np.array(_spread([*kept, stops[-1]], SLAB_ELEMENT))]
+
+
+def _orders(
+    scenario: Scenario, layer: Layer, meshes: list[Array], section: BeamSection
+) -> list[list[int]]:
+    """Hierarchical functions of every element."""
+    solution = scenario.solution
+    if solution.sines is not None:
+        return [[solution.sines[LAYERS.index(layer)]] * (len(nodes) - 1) for nodes in meshes]
+    limit = solution.frequency_limit
+    if layer == "bridge":
+        limit = min(limit, BRIDGE_LIMIT)
+    wavenumber = section.wavenumber(limit)
+    if section.shear_stiffness is not None:
+        return [
+            [math.ceil(BAY_MARGIN * wavenumber * h / np.pi) for h in np.diff(nodes)]
+            for nodes in meshes
+        ]
+    return [
+        [math.ceil(SINE_MARGIN * wavenumber * h / np.pi) + SINE_EXTRA for h in np.diff(nodes)]
+        for nodes in meshes
+    ]
+
+
+def _valid_band(
+    scenario: Scenario, meshes: list[Array], orders: list[list[int]], section: BeamSection
+) -> float:
+    """Frequency whose bending half-wave equals the shortest sine of the coarsest element."""
+    limit = scenario.solution.frequency_limit
+    for nodes, order in zip(meshes, orders, strict=True):
+        for h, n in zip(np.diff(nodes), order, strict=True):
+            limit = min(limit, section.frequency(max(n, 1) * np.pi / h))
+    return limit
+
+
+def _number(
+    scenario: Scenario,
+    meshes: Mapping[Layer, list[Array]],
+    orders: Mapping[Layer, list[list[int]]],
+    sections: Mapping[Layer, BeamSection],
+) -> tuple[dict[Layer, Field], dict[Layer, np.ndarray], int, np.ndarray]:
+    """Number the coordinates layer by layer; returns fields, dofs, their count and the held."""
+    size, held = 0, []
+    parts: dict[Layer, tuple[list[float], list[Element], list[np.ndarray]]] = {}
+    dofs: dict[Layer, np.ndarray] = {}
+    for layer in LAYERS:
+        left: list[float] = []
+        elements: list[Element] = []
+        tables: list[np.ndarray] = []
+        start = size
+        for nodes, order in zip(meshes[layer], orders[layer], strict=True):
+            first = size
+            for number, n in enumerate(order):
+                # rounding makes equal lengths share one element
+                h = round(float(nodes[number + 1] - nodes[number]), 9)
+                element = beam_element(h, sections[layer], n)
+                own = size + 2 if number == 0 else size
+                begin = first if number == 0 else end
+                end = own + n
+                tables.append(np.r_[begin, begin + 1, end, end + 1, np.arange(own, own + n)])
+                size = end + 2
+                left.append(float(nodes[number]))
+                elements.append(element)
+            if layer == "bridge":
+                if scenario.track.bridge.bearing_stiffness is None:
+                    held += [first, end]
+            elif scenario.line.ends == "pinned":
+                held += [first, end]
+        if elements:
+            parts[layer] = (left, elements, tables)
+            dofs[layer] = np.arange(start, size)
+    fields = {
+        layer: Field(np.array(left), tuple(elements), tuple(tables), size)
+        for layer, (left, elements, tables) in parts.items()
+    }
+    return fields, dofs, size, np.array(held, int)
+
+
+def _bridge_ends(field: Field) -> list[int]:
+    return [int(table[end]) for table in field.dofs for end in (0, 2)]
+
+
+def _gauss(breaks: Array, wavenumber: float) -> tuple[Array, Array]:
+    """Points and weights that integrate products of waves up to ``wavenumber`` (rad/m)."""
+    breaks = np.array(_spread(list(np.unique(np.round(breaks, 9))), 1.0))
+    lengths = np.diff(breaks)
+    # a Gauss rule resolves exp(i k x) on [-h/2, h/2] to round-off with k h / 2 + ~ 12 points
+    count = math.ceil(wavenumber * lengths.max() / 2) + 12
+    points, weights = np.polynomial.legendre.leggauss(count)
+    x = breaks[:-1, None] + lengths[:, None] * (points + 1) / 2
+    return x.ravel(), (lengths[:, None] * weights / 2).ravel()
+
+
+def _finest(field: Field) -> float:
+    """Largest wavenumber of the products of two of the field's functions (rad/m)."""
+    return max(2 * np.pi * (e.functions - 2) / e.length for e in field.elements)
+
+
+def _beam_matrices(field: Field, section: BeamSection) -> tuple[sp.csr_array, sp.csr_array]:
+    breaks = np.concatenate([field.left, field.right])
+    x, weight = _gauss(breaks, _finest(field))
+    weight = weight * (abs(field.rows(x)).sum(axis=1) > 0)
+    deflection = field.rows(x)
+    mass = _gram(deflection, weight * section.mass_per_length)
+    stiffness = _gram(field.rotation_rows(x, 1), weight * section.bending_stiffness)
+    if section.shear_stiffness is not None:
+        rotation = field.rotation_rows(x)
+        shear = sp.csr_array(field.rows(x, 1) - rotation)
+        stiffness += _gram(shear, weight * section.shear_stiffness)
+        mass += _gram(rotation, weight * section.rotary_inertia)
+    return mass, stiffness
+
+
+def _rayleigh(
+    scenario: Scenario,
+    field: Field,
+    section: BeamSection,
+    mass: sp.csr_array,
+    stiffness: sp.csr_array,
+) -> sp.csr_array:
+    """C = alpha M + beta K, ratio zeta at f1 and f2 = 4 f1 of each bare simply supported span."""
+    zeta = scenario.track.bridge.damping_ratio
+    alpha, beta = np.zeros(field.size), np.zeros(field.size)
+    for element, table in zip(field.elements, field.dofs, strict=True):
+        first = 2 * np.pi * section.frequency(np.pi / element.length)
+        alpha[table] = 2 * zeta * first * 4 * first / (5 * first)
+        beta[table] = 2 * zeta / (5 * first)
+    return sp.csr_array(sp.diags_array(alpha) @ mass + sp.diags_array(beta) @ stiffness)
+
+
+def _beds(
+    scenario: Scenario, fields: Mapping[Layer, Field]
+) -> list[tuple[sp.csr_array, Array, Array]]:
+    """Mortar and bed: rows of their compression, stiffness and damping weights."""
+    track, line = scenario.track, scenario.line
+    breaks = np.concatenate(
+        [np.r_[field.left, field.right] for layer, field in fields.items() if layer != "rail"]
+        + [[v.start, v.end] for v in track.variation]
+    )
+    finest = max(_finest(fields["slab"]), _finest(fields["support_layer"]))
+    x, weight = _gauss(np.clip(breaks, 0.0, line.length), finest)
+    slab, layer = fields["slab"].rows(x), fields["support_layer"].rows(x)
+    lower = fields["bridge"].rows(x) if "bridge" in fields else sp.csr_array(layer.shape)
+    on_bridge = np.zeros(len(x), bool)
+    for a, b in line.span_bounds:
+        on_bridge |= (x >= a) & (x <= b)
+
+    def bed(stiffness: str) -> Array:
+        over, under = track.bed_on_bridge, track.bed_on_subgrade
+        value = np.where(
+            on_bridge, getattr(over, stiffness) * over.width, getattr(under, stiffness) * under.width
+        )
+        return np.asarray(value * weight * _factor(track, f"bed.{stiffness}", x))
+
+    mortar = track.mortar
+    return [
+        (
+            sp.csr_array(slab - layer),
+            mortar.stiffness * mortar.width * weight * _factor(track, "mortar.stiffness", x),
+            mortar.damping * mortar.width * weight * _factor(track, "mortar.damping", x),
+        ),
+        (sp.csr_array(layer - lower), bed("stiffness"), bed("damping")),
+    ]
+
+
+def _fastening_rows(
+    scenario: Scenario, fields: Mapping[Layer, Field], x: float
+) -> tuple[sp.csr_array, Array, Array]:
+    """Compression rows of the fastening row at ``x`` with their stiffness and damping."""
+    track = scenario.track
+    pad = track.fastening.pad_length
+    if pad > 0:
+        points, weights = np.polynomial.legendre.leggauss(8)
+        at = np.concatenate([x - pad / 4 + points * pad / 4, x + pad / 4 + points * pad / 4])
+        share = np.concatenate([weights, weights]) / 4
+        inside = (at >= 0) & (at <= scenario.line.length)
+        at, share = at[inside], share[inside]
+    else:
+        at, share = np.array([x]), np.ones(1)
+    rows = sp.csr_array(fields["rail"].rows(at) - fields["slab"].rows(at))
+    row = np.array([x])
+    stiffness = track.fastening.stiffness * _factor(track, "fastening.stiffness", row)
+    damping = track.fastening.damping * _factor(track, "fastening.damping", row)
+    return rows, RAILS * share * stiffness, RAILS * share * damping

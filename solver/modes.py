@@ -1,0 +1,346 @@
+"""Modes of the line: real ones of (M, K), then complex ones of (M, C, K), as tables.
+
+With complex modes normalised to ``phi.T (2 lambda M + C) phi = 1`` the receptance is
+``(s^2 M + s C + K)^-1 = sum phi phi.T / (s - lambda)`` over all eigenvalues (Foss 1958), and
+``q' = lambda q + phi.T F`` are uncoupled although the damping is not proportional.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import tempfile
+from dataclasses import dataclass, fields
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+from .beam import Array
+from .errors import SolverError
+from .line import Structure, assemble
+from .scenario import Scenario
+
+Complex = NDArray[np.complex128]
+
+FORMAT = 1
+CACHE_BYTES = 2 * 2**30
+
+REAL_MARGIN = 1.5
+KEPT_MARGIN = 1.15
+GRID_PHASE = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class ModalLine:
+    """What time stepping needs of a line.
+
+    ``q' = eigenvalues q + phi(x) F``; a real field is ``sum(weights * Re(shape * q))``.
+
+    Attributes:
+        eigenvalues: (K,) lambda (1/s), Im >= 0.
+        weights: (K,) 2 for an eigenvalue that stands for its conjugate pair, 1 for a real one.
+        grid_start, grid_step: cells of the rail table: cell i starts at
+            ``grid_start + i * grid_step`` (m).
+        rail_shapes: (cells, 4, K) cubic coefficients of phi over the cell's coordinate in
+            [0, 1]; fastenings lie on cell edges, where the rail has kinks.
+        residual: (cells + 1,) point compliance of the rail at the cell edges that the kept modes
+            miss (m/N): exact static compliance less theirs.
+        channel_shapes: (C, K); displacement, strain or force of channel c is
+            ``sum(weights * Re(channel_shapes[c] * q))``.
+        channel_band: (C,) valid band of each channel (Hz).
+        length: of the line (m).
+        solved: number of complex modes that were computed, K of them kept.
+    """
+
+    eigenvalues: Complex
+    weights: Array
+    grid_start: float
+    grid_step: float
+    rail_shapes: Complex
+    residual: Array
+    channel_shapes: Complex
+    channel_band: Array
+    length: float
+    solved: int
+
+    def rail(self, x: Array | float, derivative: int = 0) -> Complex:
+        """Shapes of the rail (or their slope) at ``x`` (m), zero off the line: (len(x), K)."""
+        x = np.atleast_1d(np.asarray(x, float))
+        position = (x - self.grid_start) / self.grid_step
+        cell = np.clip(position.astype(int), 0, len(self.rail_shapes) - 1)
+        s = (position - cell)[:, None]
+        c = self.rail_shapes[cell]
+        if derivative == 0:
+            value = c[:, 0] + s * (c[:, 1] + s * (c[:, 2] + s * c[:, 3]))
+        else:
+            value = (c[:, 1] + s * (2 * c[:, 2] + 3 * s * c[:, 3])) / self.grid_step
+        value[(x < 0) | (x > self.length)] = 0
+        return np.asarray(value)
+
+    def rail_receptance(self, frequency: Array, x: float, y: float | None = None) -> Complex:
+        """Receptance of the rail (m/N) at ``x`` for a force at ``y`` (default x): (F,)."""
+        return self._receptance(frequency, self.rail(x)[0], x if y is None else y, y in (None, x))
+
+    def channel_receptance(self, frequency: Array, channel: int, y: float) -> Complex:
+        """Channel response per force on the rail at ``y`` (m): (F,)."""
+        return self._receptance(frequency, self.channel_shapes[channel], y, False)
+
+    def _receptance(self, frequency: Array, shape: Complex, y: float, own: bool) -> Complex:
+        s = 2j * np.pi * np.asarray(frequency, float)[:, None]
+        product = shape * self.rail(y)[0]
+        pair = self.weights > 1
+        value = (product / (s - self.eigenvalues)).sum(axis=1)
+        value += (product[pair].conj() / (s - self.eigenvalues[pair].conj())).sum(axis=1)
+        if own:
+            edges = self.grid_start + self.grid_step * np.arange(len(self.residual))
+            value += np.interp(y, edges, self.residual)
+        return np.asarray(value)
+
+
+def real_modes(structure: Structure, limit: float | None = None) -> tuple[Array, Array]:
+    """Undamped modes up to ``limit`` (Hz): angular frequencies (n,), shapes (N, n), mass 1.
+
+    Raises:
+        SolverError: mass or stiffness is not positive definite.
+    """
+    scale = 1 / np.sqrt(structure.mass.diagonal())
+    mass = structure.mass.toarray() * scale[:, None] * scale
+    stiffness = structure.stiffness.toarray() * scale[:, None] * scale
+    try:
+        # all vectors by divide and conquer are faster than a large subset
+        squared, vectors = scipy.linalg.eigh(
+            stiffness, mass, driver="gvd", overwrite_a=True, overwrite_b=True, check_finite=False
+        )
+    except np.linalg.LinAlgError as error:
+        raise SolverError(
+            f"mass matrix of {structure.size} coordinates is not positive definite: {error}; "
+            "use fewer hierarchical functions"
+        ) from None
+    if squared[0] <= 0:
+        raise SolverError(
+            f"lowest eigenvalue of the stiffness = {squared[0]:.3g} 1/s^2; limit > 0: a part of "
+            "the track is not held"
+        )
+    omega = np.sqrt(squared)
+    count = len(omega) if limit is None else int(np.searchsorted(omega, 2 * np.pi * limit))
+    return omega[:count], vectors[:, :count] * scale[:, None]
+
+
+def complex_modes(omega: Array, damping: Array) -> tuple[Complex, Complex, Array]:
+    """Complex modes of ``q'' + damping q' + omega^2 q = 0`` in real modal coordinates.
+
+    Returns:
+        eigenvalues (K,) with Im >= 0, vectors (n, K) with
+        ``phi.T (2 lambda + damping) phi = 1``, weights (K,): 2 for a pair, 1 for a real one.
+
+    Raises:
+        SolverError: an eigenvalue has a positive real part, or the modes are defective.
+    """
+    n = len(omega)
+    state = np.block([[np.zeros((n, n)), np.diag(omega)], [-np.diag(omega), -damping]])
+    values, vectors = scipy.linalg.eig(state, overwrite_a=True, check_finite=False)
+    upper = values.imag >= 0
+    values, vectors = values[upper], vectors[:, upper]
+    worst = float((values.real / np.maximum(abs(values), 1e-300)).max())
+    if worst > 1e-9:
+        raise SolverError(f"damping ratio of a mode = {-worst:.3g}; limit >= 0: unstable")
+    order = np.argsort(abs(values))
+    values, vectors = values[order], vectors[:, order]
+    # state (omega q, q'): the velocity half is lambda q, the better scaled one
+    shapes = vectors[:n] / omega[:, None]
+    velocity = vectors[n:]
+    _orthogonalise_clusters(values, shapes, velocity, damping)
+    norm = 2 * (shapes * velocity).sum(axis=0) + (shapes * (damping @ shapes)).sum(axis=0)
+    size = abs(shapes * velocity).sum(axis=0)
+    flat = int(np.argmin(abs(norm) / size))
+    if abs(norm[flat]) < 1e-8 * size[flat]:
+        raise SolverError(
+            f"modes at {values[flat]:.6g} 1/s are defective: norm = "
+            f"{abs(norm[flat]) / size[flat]:.3g}; limit 1e-8"
+        )
+    return values, shapes / np.sqrt(norm), np.where(values.imag > 0, 2.0, 1.0)
+
+
+def _orthogonalise_clusters(
+    values: Complex, shapes: Complex, velocity: Complex, damping: Array
+) -> None:
+    """Make vectors of (nearly) equal eigenvalues orthogonal in the bilinear form, in place."""
+    close = abs(np.subtract.outer(values, values)) < 1e-7 * abs(values)
+    _, label = scipy.sparse.csgraph.connected_components(sp.csr_array(close), directed=False)
+    for group in np.flatnonzero(np.bincount(label) > 1):
+        chosen = np.flatnonzero(label == group)
+        a, b = shapes[:, chosen], velocity[:, chosen]
+        gram = a.T @ b + b.T @ a + a.T @ damping @ a
+        root = scipy.linalg.inv(scipy.linalg.sqrtm((gram + gram.T) / 2))
+        shapes[:, chosen], velocity[:, chosen] = a @ root, b @ root
+
+
+def build_modal_line(structure: Structure) -> ModalLine:
+    """Modal tables of a structure, computed."""
+    scenario = structure.scenario
+    limit = scenario.solution.frequency_limit
+    omega, real = real_modes(structure, REAL_MARGIN * limit)
+    damping = real.T @ (structure.damping @ real)
+    values, vectors, weights = complex_modes(omega, damping)
+    solved = len(values)
+    kept = abs(values) <= 2 * np.pi * KEPT_MARGIN * limit
+    values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
+    start, step, cells = _grid(structure)
+    edges = start + step * np.arange(cells + 1)
+    rail = _cubics(structure, real, edges)
+    table = np.empty((cells, 4, len(values)), complex)
+    for part in range(4):
+        table[:, part] = rail[:, part] @ vectors
+    channels = np.empty((len(scenario.channel), len(values)), complex)
+    for number, channel in enumerate(scenario.channel):
+        probe = structure.probe(channel)
+        channels[number] = (
+            (probe.displacement_rows @ real) @ vectors
+            + (probe.velocity_rows @ real) @ vectors * values
+            + (probe.acceleration_rows @ real) @ vectors * values**2
+        )[0]
+    at = structure.rail_rows(np.clip(edges, 0, structure.length))
+    static = point_compliance(structure, at)
+    shapes = (at @ real) @ vectors
+    return ModalLine(
+        eigenvalues=values,
+        weights=weights,
+        grid_start=start,
+        grid_step=step,
+        rail_shapes=table,
+        residual=static - (weights * (shapes**2 / -values).real).sum(axis=1),
+        channel_shapes=channels,
+        channel_band=np.array([structure.channel_band(c) for c in scenario.channel]),
+        length=structure.length,
+        solved=solved,
+    )
+
+
+def point_compliance(structure: Structure, rows: sp.csr_array) -> Array:
+    """Static compliance of each row at itself (m/N): diag(rows K^-1 rows.T), (len(rows),)."""
+    factor = scipy.sparse.linalg.splu(sp.csc_array(structure.stiffness))
+    value = np.empty(rows.shape[0])
+    for begin in range(0, rows.shape[0], 256):
+        block = rows[begin : begin + 256].toarray()
+        value[begin : begin + 256] = (block * factor.solve(block.T).T).sum(axis=1)
+    return value
+
+
+def _grid(structure: Structure) -> tuple[float, float, int]:
+    """Start (m), step (m) and number of cells: fastenings on edges, rail waves resolved."""
+    from .line import beam_sections
+
+    scenario = structure.scenario
+    wavenumber = beam_sections(scenario.track)["rail"].wavenumber(scenario.solution.frequency_limit)
+    spacing = scenario.track.fastening.spacing
+    step = spacing / (2 * math.ceil(spacing * wavenumber / GRID_PHASE / 2))
+    first = float(structure.fastenings[0]) if len(structure.fastenings) else 0.0
+    start = first - step * math.ceil(first / step - 1e-9)
+    return start, step, math.ceil((structure.length - start) / step - 1e-9)
+
+
+def _cubics(structure: Structure, real: Array, edges: Array) -> Array:
+    """Cubic coefficients of the real rail shapes over every cell: (cells, 4, n)."""
+    length = structure.length
+    a, b = np.clip(edges[:-1], 0, length), np.clip(edges[1:], 0, length)
+    field, h = structure.fields["rail"], (b - a)[:, None]
+    # slopes are taken just inside the cell: the rail may have a kink at its edge
+    inner = 1e-7 * (b - a)
+    left, right = field.rows(a) @ real, field.rows(b) @ real
+    left_slope = field.rows(a + inner, 1) @ real * h
+    right_slope = field.rows(b - inner, 1) @ real * h
+    c0, c1 = left, left_slope
+    c2 = 3 * (right - left) - 2 * left_slope - right_slope
+    c3 = 2 * (left - right) + left_slope + right_slope
+    # the first and last cell may stick out of the line: t = alpha + beta s there
+    alpha = ((edges[:-1] - a) / (b - a))[:, None]
+    beta = ((edges[1:] - edges[:-1]) / (b - a))[:, None]
+    return np.stack(
+        [
+            c0 + alpha * (c1 + alpha * (c2 + alpha * c3)),
+            beta * (c1 + alpha * (2 * c2 + 3 * alpha * c3)),
+            beta**2 * (c2 + 3 * alpha * c3),
+            beta**3 * c3,
+        ],
+        axis=1,
+    )
+
+
+def modal_line(scenario: Scenario) -> ModalLine:
+    """Modal tables of a scenario's line, from the disk cache when it was solved before.
+
+    Raises:
+        SolverError: see :func:`real_modes` and :func:`complex_modes`.
+    """
+    path = _cache_path(scenario)
+    found = _read(path)
+    if found is None:
+        found = build_modal_line(assemble(scenario))
+        _write(path, found)
+    return found
+
+
+def _cache_path(scenario: Scenario) -> Path:
+    part = scenario.model_dump(
+        mode="json", include={"track", "line", "channel", "solution", "irregularity"}
+    )
+    part = {
+        "track": part["track"],
+        "line": part["line"],
+        "channel": part["channel"],
+        "solution": {key: part["solution"][key] for key in ("frequency_limit", "sines")},
+        "format": FORMAT,
+        "version": _version(),
+    }
+    digest = hashlib.sha256(json.dumps(part, sort_keys=True).encode()).hexdigest()[:32]
+    return Path(platformdirs.user_cache_dir("trackvib", appauthor=False)) / f"line-{digest}.npz"
+
+
+def _version() -> str:
+    try:
+        return metadata.version("trackvib")
+    except metadata.PackageNotFoundError:
+        return "source"
+
+
+def _read(path: Path) -> ModalLine | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            values = {field.name: stored[field.name] for field in fields(ModalLine)}
+        os.utime(path)
+    except (OSError, KeyError, ValueError, EOFError):
+        return None
+    for name in ("grid_start", "grid_step", "length"):
+        values[name] = float(values[name])
+    values["solved"] = int(values["solved"])
+    return ModalLine(**values)
+
+
+def _write(path: Path, line: ModalLine) -> None:
+    """Store atomically and keep the cache bounded; a cache that cannot be written is skipped."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, **{f.name: getattr(line, f.name) for f in fields(ModalLine)})
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        stored = sorted(path.parent.glob("line-*.npz"), key=lambda p: p.stat().st_mtime)
+        total = sum(p.stat().st_size for p in stored)
+        for old in stored[:-1]:
+            if total <= CACHE_BYTES:
+                break
+            total -= old.stat().st_size
+            old.unlink()
