@@ -1,0 +1,377 @@
+"""Waves in beams and in a rail on fastenings: dispersion, mobility, direct field.
+
+Time factor exp(+i omega t). A beam carries ``w`` (deflection) and ``theta`` (rotation),
+
+    kGA (w' - theta)' + Z w = -f,          Z = m omega^2 - k' - i omega c'
+    EI theta'' + kGA (w' - theta) + rho I omega^2 theta = 0,
+
+so exp(s x) needs ``EI s^4 + (Z EI/kGA + rho I omega^2) s^2 + Z (rho I omega^2/kGA - 1) = 0``
+(Timoshenko 1921; Euler-Bernoulli for kGA -> infinity and rho I = 0: EI s^4 = Z).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .scenario import Bed, Plate, Track
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class WaveBeam:
+    """An infinite uniform beam, on a uniform elastic support if that is given.
+
+    Attributes:
+        bending_stiffness: EI (N*m^2).
+        mass_per_length: m (kg/m).
+        shear_stiffness: kappa G A (N); infinite means Euler-Bernoulli.
+        rotary_inertia: rho I (kg*m).
+        support_stiffness: k' (N/m^2).
+        support_damping: c' (N*s/m^2).
+    """
+
+    bending_stiffness: float
+    mass_per_length: float
+    shear_stiffness: float = math.inf
+    rotary_inertia: float = 0.0
+    support_stiffness: float = 0.0
+    support_damping: float = 0.0
+
+    def inertia_term(self, omega: ArrayLike) -> Complex:
+        """Z = m omega^2 - k' - i omega c' (N/m^2), shape of ``omega`` (rad/s)."""
+        w = np.asarray(omega, dtype=np.float64)
+        return (
+            self.mass_per_length * w**2
+            - self.support_stiffness
+            - 1j * w * self.support_damping
+        )
+
+    def exponents(self, omega: ArrayLike) -> Complex:
+        """Decaying exponents s (1/m): the field is a sum of exp(-s |x|).
+
+        Returns:
+            Shape ``(..., 2)``: first the travelling wave (s = i q + decay), then the near field.
+        """
+        w = np.asarray(omega, dtype=np.float64)
+        z = self.inertia_term(w)
+        rotary = self.rotary_inertia * w**2
+        b = z * self.bending_stiffness / self.shear_stiffness + rotary
+        c = z * (rotary / self.shear_stiffness - 1)
+        root = np.sqrt(b * b - 4 * self.bending_stiffness * c)
+        squares = np.stack((-b - root, -b + root), axis=-1) / (2 * self.bending_stiffness)
+        s = np.sqrt(squares)
+        flip = (s.real < 0) | ((np.abs(s.real) < 1e-12 * np.abs(s)) & (s.imag < 0))
+        s = np.where(flip, -s, s)
+        # Travelling first: the exponent with the larger phase per metre.
+        order = np.argsort(-np.abs(s.imag) / np.abs(s), axis=-1, kind="stable")
+        return np.take_along_axis(s, order, axis=-1)
+
+    def wavenumber(self, omega: ArrayLike) -> Real:
+        """Real wavenumber q of the travelling wave (rad/m), shape of ``omega`` (rad/s)."""
+        return np.abs(self.exponents(omega)[..., 0].imag)
+
+    def group_velocity(self, omega: ArrayLike) -> Real:
+        """c_g = d omega / d q of the undamped beam (m/s), shape of ``omega`` (rad/s)."""
+        w = np.asarray(omega, dtype=np.float64)
+        bare = WaveBeam(
+            self.bending_stiffness,
+            self.mass_per_length,
+            self.shear_stiffness,
+            self.rotary_inertia,
+            self.support_stiffness,
+        )
+        h = 1e-4
+        return np.asarray(
+            2 * h * w / (bare.wavenumber(w * (1 + h)) - bare.wavenumber(w * (1 - h)))
+        )
+
+    def modal_density(self, omega: ArrayLike, length: float) -> Real:
+        """n = L / (pi c_g), modes per rad/s (Lyon and DeJong 1995, one-dimensional systems)."""
+        return length / (np.pi * self.group_velocity(omega))
+
+    def transfer_receptance(self, omega: ArrayLike, distance: ArrayLike) -> Complex:
+        """Displacement at ``distance`` (m) per point force (m/N), infinite beam.
+
+        Residues of the Fourier integral over the wavenumber; at distance zero and for
+        Euler-Bernoulli this is -(1 + i)/(4 EI q^3).
+        """
+        w, x = np.broadcast_arrays(
+            np.asarray(omega, dtype=np.float64), np.asarray(distance, dtype=np.float64)
+        )
+        s = self.exponents(w)
+        square = s**2
+        numerator = (
+            self.bending_stiffness * square / self.shear_stiffness
+            - 1
+            + (self.rotary_inertia * w**2 / self.shear_stiffness)[..., None]
+        )
+        gap = self.bending_stiffness * (square - square[..., ::-1])
+        waves = numerator / gap * np.exp(-s * np.abs(x)[..., None]) / (2 * s)
+        return np.asarray(waves.sum(axis=-1))
+
+    def point_mobility(self, omega: ArrayLike) -> Complex:
+        """Velocity per force at the driven point, Y = i omega alpha (m/(N*s))."""
+        w = np.asarray(omega, dtype=np.float64)
+        return 1j * w * self.transfer_receptance(w, 0.0)
+
+
+def rail_beam(track: Track) -> WaveBeam:
+    """Both rails as one free beam, theory as the track states it."""
+    rail = track.rail
+    modulus, inertia = rail.young_modulus, 2 * rail.second_moment
+    if rail.theory == "euler_bernoulli":
+        return WaveBeam(modulus * inertia, 2 * rail.mass_per_length)
+    shear = modulus / (2 * (1 + rail.poisson_ratio))
+    density = rail.mass_per_length / rail.area
+    return WaveBeam(
+        modulus * inertia,
+        2 * rail.mass_per_length,
+        rail.shear_coefficient * shear * 2 * rail.area,
+        density * inertia,
+    )
+
+
+def plate_beam(plate: Plate, *beds: Bed) -> WaveBeam:
+    """A concrete layer held by the beds that touch it, their far sides at rest."""
+    return WaveBeam(
+        plate.bending_stiffness,
+        plate.mass_per_length,
+        support_stiffness=sum(bed.stiffness * bed.width for bed in beds),
+        support_damping=sum(bed.damping * bed.width for bed in beds),
+    )
+
+
+def pinned_pinned_frequency(track: Track) -> float:
+    """First pinned-pinned frequency of the rail between two fastenings (Hz).
+
+    The half wave pi/a of the free rail; exact for both beam theories, because a sine satisfies
+    the pinned ends.
+    """
+    rail = rail_beam(track)
+    q2 = (math.pi / track.fastening.spacing) ** 2
+    ei, m = rail.bending_stiffness, rail.mass_per_length
+    if math.isinf(rail.shear_stiffness):
+        return math.sqrt(ei / m) * q2 / (2 * math.pi)
+    g, r = rail.shear_stiffness, rail.rotary_inertia
+    # m r w^4 - (m EI q^2 + g m + g r q^2) w^2 + g EI q^4 = 0
+    a, b, c = m * r, m * ei * q2 + g * m + g * r * q2, g * ei * q2 * q2
+    return math.sqrt((b - math.sqrt(b * b - 4 * a * c)) / (2 * a)) / (2 * math.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class BlochField:
+    """The travelling Bloch wave at every frequency, per unit mean power it carries.
+
+    Attributes:
+        decay: energy decay along the track, power ~ exp(-decay x) (1/m), shape (F,).
+        energy_velocity: power / (m' <v^2>) with <v^2> the mean over a bay (m/s), shape (F,).
+        pattern: |v(x)|^2 / <v^2> at the places asked for, shape (F, P).
+        strain_pattern: |theta'(x)|^2 / <v^2> (s^2/m^2 * 1/m^2), shape (F, P).
+    """
+
+    decay: Real
+    energy_velocity: Real
+    pattern: Real
+    strain_pattern: Real
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodicRail:
+    """An infinite rail on equal discrete supports: exact by Bloch waves (Floquet).
+
+    The bay is [0, spacing) with its support at spacing / 2, spread over ``pad_length``.
+
+    Attributes:
+        beam: the free rail.
+        spacing: distance of the supports (m).
+        stiffness: stiffness of a support (N/m).
+        damping: dashpot of a support (N*s/m).
+        pad_length: length over which a support acts (m).
+        foundation: beam under the supports, whose point receptance is in series, or None.
+    """
+
+    beam: WaveBeam
+    spacing: float
+    stiffness: float
+    damping: float
+    pad_length: float = 0.0
+    foundation: WaveBeam | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a pad longer than the bay."""
+        if self.pad_length >= self.spacing:
+            raise InputError(
+                f"track.fastening.pad_length = {self.pad_length} m must be less than "
+                f"track.fastening.spacing = {self.spacing} m"
+            )
+
+    @classmethod
+    def of_track(
+        cls, track: Track, stiffness_factor: float = 1.0, damping_factor: float = 1.0
+    ) -> PeriodicRail:
+        """Both rails of a track on their fastenings, slab on mortar as foundation."""
+        fastening = track.fastening
+        return cls(
+            rail_beam(track),
+            fastening.spacing,
+            2 * fastening.stiffness * stiffness_factor,
+            2 * fastening.damping * damping_factor,
+            fastening.pad_length,
+            plate_beam(track.slab, track.mortar),
+        )
+
+    def support_stiffness(self, omega: ArrayLike) -> Complex:
+        """Dynamic stiffness of a support, foundation in series (N/m)."""
+        w = np.asarray(omega, dtype=np.float64)
+        pad = self.stiffness + 1j * w * self.damping
+        if self.foundation is None:
+            return pad
+        return pad / (1 + pad * self.foundation.transfer_receptance(w, 0.0))
+
+    def _supports(self) -> list[tuple[float, float]]:
+        middle = self.spacing / 2
+        if self.pad_length == 0:
+            return [(middle, 1.0)]
+        nodes, weights = np.polynomial.legendre.leggauss(4)
+        return [
+            (middle + self.pad_length / 2 * float(node), float(weight) / 2)
+            for node, weight in zip(nodes, weights, strict=True)
+        ]
+
+    def _carry(self, omega: Real, length: float) -> Complex:
+        """Transfer matrices of (w, theta, V, M) over a free length, shape (F, 4, 4)."""
+        s = self.beam.exponents(omega)
+        roots = np.concatenate((s, -s), axis=-1)
+        z = self.beam.inertia_term(omega)[:, None]
+        theta = roots + z / roots / self.beam.shear_stiffness
+        shapes = np.stack(
+            (
+                np.ones_like(roots),
+                theta,
+                -z / roots,
+                self.beam.bending_stiffness * roots * theta,
+            ),
+            axis=1,
+        )
+        moved = shapes * np.exp(roots * length)[:, None, :]
+        return np.asarray(moved @ np.linalg.inv(shapes))
+
+    def _to(self, omega: Real, x: float) -> Complex:
+        """State at x in the bay from the state at the bay's start, shape (F, 4, 4)."""
+        stiffness = self.support_stiffness(omega)
+        total = np.broadcast_to(np.eye(4, dtype=np.complex128), (omega.size, 4, 4)).copy()
+        place = 0.0
+        for support, share in self._supports():
+            if support > x:
+                break
+            total = self._carry(omega, support - place) @ total
+            total[:, 2, :] += share * stiffness[:, None] * total[:, 0, :]
+            place = support
+        return np.asarray(self._carry(omega, x - place) @ total)
+
+    def _bloch(self, omega: Real) -> tuple[Complex, Complex]:
+        """Multipliers (F, 4) and states (F, 4, 4): right travelling, right near, then left."""
+        # Scaling the state keeps the eigenproblem well conditioned.
+        scale = self._scale(omega)
+        period = self._to(omega, self.spacing)
+        period = period * scale[:, None, :] / scale[:, :, None]
+        values, vectors = np.linalg.eig(period)
+        order = np.argsort(-np.abs(values), axis=-1)
+        # |mu|: left near > left travelling > right travelling > right near
+        order = order[:, [2, 3, 1, 0]]
+        values = np.take_along_axis(values, order, axis=-1)
+        vectors = np.take_along_axis(vectors, order[:, None, :], axis=-1)
+        return values, vectors * scale[:, :, None]
+
+    def _scale(self, omega: Real) -> Real:
+        q = np.abs(self.beam.exponents(omega)[:, 0])
+        ei = self.beam.bending_stiffness
+        return np.stack((np.ones_like(q), q, ei * q**3, ei * q**2), axis=-1)
+
+    def _excite(self, omega: Real, load: float) -> tuple[Complex, Complex, Complex]:
+        values, states = self._bloch(omega)
+        scale = self._scale(omega)
+        jump = np.zeros((omega.size, 4, 1), dtype=np.complex128)
+        jump[:, 2, 0] = -1.0
+        to_load = self._to(omega, load)
+        scaled = (to_load @ states) / scale[:, :, None]
+        scaled[:, :, 2:] *= -1
+        amplitudes = np.linalg.solve(scaled, jump / scale[:, :, None])[:, :, 0]
+        return values, states, amplitudes
+
+    def receptance(self, omega: ArrayLike, load: float, place: float) -> Complex:
+        """Displacement at ``place`` per point force at ``load`` (m/N), shape (F,).
+
+        Both in m from the start of one bay, whose support is at spacing / 2.
+
+        Raises:
+            InputError: a frequency that is not positive.
+        """
+        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        if not np.all(w > 0):
+            raise InputError(f"omega = {w.min():g} rad/s: must be positive")
+        shift = math.floor(load / self.spacing) * self.spacing
+        load, place = load - shift, place - shift
+        bay = math.floor(place / self.spacing)
+        inside = place - bay * self.spacing
+        values, states, amplitudes = self._excite(w, load)
+        side = slice(0, 2) if place >= load else slice(2, 4)
+        travelled = states[:, :, side] * (amplitudes * values**bay)[:, None, side]
+        return np.asarray((self._to(w, inside) @ travelled)[:, 0, :].sum(axis=-1))
+
+    def load_positions(self, count: int = 12) -> Real:
+        """Equally weighted positions of a load over one bay (m), shape (count,)."""
+        return (np.arange(count) + 0.5) * self.spacing / count
+
+    def point_receptances(self, omega: ArrayLike, count: int = 12) -> Complex:
+        """Driving-point receptances over one bay (m/N), shape (count, F)."""
+        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        return np.stack([self.receptance(w, x, x) for x in self.load_positions(count)])
+
+    def travelling(self, omega: ArrayLike, places: ArrayLike = ()) -> BlochField:
+        """Decay, energy velocity and bay pattern of the travelling Bloch wave.
+
+        Args:
+            omega: rad/s, shape (F,).
+            places: positions (m) from the start of a bay, shape (P,).
+        """
+        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
+        x = np.atleast_1d(np.asarray(places, dtype=np.float64)) % self.spacing
+        values, states = self._bloch(w)
+        wave = states[:, :, 0]
+        decay = -2 * np.log(np.abs(values[:, 0])) / self.spacing
+
+        def square(place: float) -> tuple[Real, Real]:
+            # Removing the mean decay leaves the periodic part of the wave.
+            state = (self._to(w, place) @ wave[:, :, None])[:, :, 0]
+            gain = np.exp(decay * place)
+            speed = np.abs(w * state[:, 0]) ** 2 * gain
+            bending = np.abs(state[:, 3] / self.beam.bending_stiffness) ** 2 * gain
+            return speed, bending
+
+        samples = [square(place)[0] for place in self.load_positions(24)]
+        mean = np.mean(samples, axis=0)
+        velocity = 1j * w[:, None] * wave[:, :2]
+        power = -np.real(
+            wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj()
+        )
+        # The rail itself loses nothing: the power falls in one step at the support in mid-bay.
+        # With the smooth decay removed its mean over the bay is the factor sinh(h)/h.
+        h = decay * self.spacing / 2
+        mean_power = power * np.sinh(h) / h
+        patterns = [square(float(place)) for place in x]
+        speed = np.stack([p[0] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
+        bending = np.stack([p[1] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
+        return BlochField(
+            decay,
+            mean_power / (self.beam.mass_per_length * mean),
+            speed / mean[:, None],
+            bending / mean[:, None],
+        )
