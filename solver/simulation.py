@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -9,12 +10,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import InputError
+from .modal import ModalRun
+from .modes import modal_line
 from .motion import TrainMotion
 from .quality import QualityReport
 from .scenario import Scenario, Train
+from .traffic import Traffic
 
 Array = NDArray[np.float64]
 Output = Literal["displacement", "velocity", "acceleration"]
+OUTPUTS: tuple[Output, ...] = ("displacement", "velocity", "acceleration")
 
 SETTLE_TIME = 2.0
 """Time (s) that a run of unstated end goes on after the last wheelset has left the line."""
@@ -60,9 +66,7 @@ class Simulation:
     Attributes:
         scenario: the scenario, trains added at run time included.
         step_ns: time step (ns).
-        end_index: number of samples from t = 0 to the end of the run.
         channels: channel names, one per column of the block's signals.
-        motions: kinematics of every train.
     """
 
     def __init__(
@@ -72,12 +76,32 @@ class Simulation:
         outputs: Sequence[Output] = ("acceleration",),
         report: Callable[[str], None] | None = None,
     ) -> None:
+        tell = report or (lambda message: None)
         self.scenario = scenario
         self.step_ns = scenario.solution.step_ns
         self.channels = tuple(channel.name for channel in scenario.channel)
-        self.motions = [TrainMotion(train) for train in scenario.train]
-        self.end_index = 0
-        self._outputs = tuple(outputs)
+        self._outputs: tuple[Output, ...] = tuple(name for name in OUTPUTS if name in outputs)
+        self._traffic = Traffic(scenario)
+        self._index = 0
+        _check_step(scenario)
+        derivatives = tuple(OUTPUTS.index(name) for name in self._outputs)
+        tell("modes of the line: computed once, then kept")
+        self._line = modal_line(scenario)
+        tell(f"{len(self._line.eigenvalues)} modes; compiling or loading the stepping kernel")
+        self._run = ModalRun(self._line, self._traffic, derivatives)
+
+    @property
+    def motions(self) -> list[TrainMotion]:
+        """Kinematics of every train."""
+        return self._traffic.motions
+
+    @property
+    def end_index(self) -> int:
+        """Number of samples from t = 0 to the end of the run."""
+        end = self.scenario.solution.end_time
+        if end is None:
+            end = self._traffic.last_exit() + SETTLE_TIME
+        return math.floor(end / (self.step_ns * 1e-9) + 1e-9) + 1
 
     @property
     def train_of_wheelset(self) -> NDArray[np.intp]:
@@ -88,19 +112,43 @@ class Simulation:
     @property
     def quality(self) -> QualityReport:
         """How far the samples so far can be trusted."""
-        raise NotImplementedError
+        return QualityReport(
+            samples=self._index,
+            equilibrium_residual=self._run.equilibrium_residual,
+            energy_residual=None,
+            lost_contacts=self._run.lost_contacts,
+            valid_band=dict(zip(self.channels, self._line.channel_band.tolist(), strict=True)),
+        )
 
     def advance(self, samples: int) -> Block:
-        """The next ``samples`` samples.
+        """The next ``samples`` samples; there is no end to a run.
 
         Raises:
             SolverError: the computation left its valid range.
         """
-        raise NotImplementedError
+        index = self._index
+        time = (index + np.arange(samples)) * self.step_ns * 1e-9
+        position = self._traffic.position(time)
+        force, signals = self._run.advance(index, time, position)
+        self._index += samples
+        width = len(self.channels)
+        parts: dict[Output, Array] = {
+            name: signals[:, i * width : (i + 1) * width] for i, name in enumerate(self._outputs)
+        }
+        return Block(
+            index=index,
+            time=time,
+            wheelset_position=position,
+            wheelset_force=force,
+            displacement=parts.get("displacement"),
+            velocity=parts.get("velocity"),
+            acceleration=parts.get("acceleration"),
+        )
 
     def blocks(self, samples: int = 800) -> Iterator[Block]:
         """Blocks of ``samples`` samples to ``end_index``; the last one may be shorter."""
-        raise NotImplementedError
+        while self._index < self.end_index:
+            yield self.advance(min(samples, self.end_index - self._index))
 
     def add_train(self, train: Train, start_time: float) -> int:
         """Add a train that is at ``train.start`` at ``start_time`` (s); returns its index.
@@ -110,4 +158,26 @@ class Simulation:
         Raises:
             InputError: a wheelset would appear on the line out of nowhere.
         """
-        raise NotImplementedError
+        train = train.model_copy(update={"start_time": start_time})
+        now = self._index * self.step_ns * 1e-9
+        place = TrainMotion(train).position(now)
+        if self._index > 0 and ((place >= 0) & (place <= self.scenario.line.length)).any():
+            axle = int(np.argmax((place >= 0) & (place <= self.scenario.line.length)))
+            raise InputError(
+                f"train added at t = {now:.6g} s: its wheelset {axle + 1} would be at x = "
+                f"{place[axle]:.6g} m, on the line of {self.scenario.line.length:g} m already: "
+                "choose a later start_time or a start farther away"
+            )
+        index = self._traffic.add(train, self._index)
+        self.scenario = self.scenario.model_copy(update={"train": (*self.scenario.train, train)})
+        self._run.reconsider()
+        return index
+
+
+def _check_step(scenario: Scenario) -> None:
+    step, limit = scenario.solution.step, scenario.solution.frequency_limit
+    if step * limit > 0.5:
+        raise InputError(
+            f"solution.step = {step:g} s is too long for solution.frequency_limit = {limit:g} Hz: "
+            f"at most 1/(2 frequency_limit) = {0.5 / limit:.3g} s"
+        )

@@ -1,0 +1,682 @@
+"""Exact exponential stepping of complex modes under wheelsets that move along them.
+
+Each mode obeys q' = lambda q + p with p = sum of phi(x_i) F_i over the wheelsets on the line. With
+p interpolated over the step h through its samples p'', p', p (the last two and the new one),
+
+    q = E q' + a p + b p' + c p'',   E = exp(lambda h),
+
+the weights a, b, c being integrals of exp(lambda (h - t)) times Lagrange polynomials. In place of
+q the stepper keeps y, with q = y + a p - (c/E) p', which needs no memory of p:
+
+    y_next = E y + d p,   d = E a + b + c/E.
+
+The displacement of the rail at a wheelset is then a sum over the modes of y, known before the
+force, plus tabled compliances times the own new and last force. Compliances between different
+wheelsets within one step are left out: waves travel less than 0.2 m in 25 us.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .contact import force_of, solve_contact
+from .errors import SolverError
+from .modes import ModalLine
+from .traffic import Running, Traffic
+from .vehicle import UnitStep, block_units, discretise, static_start
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+LANES = 16
+SLOW = 0.05
+"""Modes that decay below this factor within one step are given forces linear in the step."""
+
+
+def exponential_weights(
+    eigenvalues: Complex, step: float, order: int
+) -> tuple[Complex, Complex, Complex, Complex]:
+    """E, a, b, c of the step ``q = E q' + a p + b p' + c p''`` (all (K,); a, b, c in s).
+
+    With the functions phi_j(z) = (phi_{j-1}(z) - 1/(j-1)!)/z, phi_0 = exp, the integral of
+    exp(lambda (h - t)) (t/h)^j over the step is h j! phi_{j+1}(lambda h).
+    """
+    z = eigenvalues * step
+    decay = np.exp(z)
+    phi = [decay]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for j in range(1, 4):
+            phi.append((phi[-1] - 1 / math.factorial(j - 1)) / z)
+    small = np.abs(z) < 0.7
+    for j in range(1, 4):
+        series = sum(z**m / math.factorial(m + j) for m in range(18))
+        phi[j] = np.where(small, series, phi[j])
+    constant, linear, quadratic = step * phi[1], step * phi[2], 2 * step * phi[3]
+    if order == 1:
+        return decay, linear, constant - linear, np.zeros_like(decay)
+    slow = np.abs(decay) < SLOW
+    now = np.where(slow, linear, (quadratic + linear) / 2)
+    last = np.where(slow, constant - linear, constant - quadratic)
+    before = np.where(slow, 0.0, (quadratic - linear) / 2)
+    return decay, now, last, before
+
+
+@dataclass(frozen=True, eq=False)
+class ModalTables:
+    """A :class:`ModalLine` made ready for one step length.
+
+    K is padded with zeros to a multiple of 16; weights are folded into the shapes as square roots.
+
+    Attributes:
+        shapes: (cells, 8, K) re and im of the four cubic coefficients of the rail shapes.
+        decay, drive: (2, K) re and im of E and d.
+        compliance: (2, cells, 4) m/N, cubic coefficients: rail displacement at a wheelset per its
+            new and its last force, residual compliance in the former.
+        channel_weights: (2K, O) output = history of y @ channel_weights + feed-through.
+        channel_feed: (2, cells, 4, O) cubic coefficients of the feed-through per new, last force.
+        start_weights: (2, K) complex: y before sample 0 = start_weights[0] p for a static p.
+        grid_start, grid_step, length: m.
+    """
+
+    shapes: NDArray[np.floating]
+    decay: Array
+    drive: Array
+    compliance: Array
+    channel_weights: Array
+    channel_feed: Array
+    start_weights: Complex
+    grid_start: float
+    grid_step: float
+    length: float
+
+    @property
+    def size(self) -> int:
+        """Padded number of modes."""
+        return int(self.decay.shape[1])
+
+
+def modal_tables(
+    line: ModalLine,
+    step: float,
+    derivatives: tuple[int, ...],
+    *,
+    order: int = 2,
+    precision: type[np.floating] = np.float64,
+) -> ModalTables:
+    """Tables for a time step (s); channel outputs are ordered derivative by derivative.
+
+    Args:
+        line: modes of the line.
+        step: time step (s).
+        derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+        order: 1 or 2, interpolation of the forces in time.
+        precision: of the rail shapes.
+    """
+    modes = len(line.eigenvalues)
+    size = -(-modes // LANES) * LANES
+    root = np.sqrt(line.weights)
+    cells = len(line.rail_shapes)
+    shapes = line.rail_shapes * root
+    lam = line.eigenvalues
+    decay, now, last, before = exponential_weights(lam, step, order)
+    recall = -before / decay
+
+    packed = np.zeros((cells, 8, size), dtype=precision)
+    packed[:, 0::2, :modes] = shapes.real
+    packed[:, 1::2, :modes] = shapes.imag
+
+    def split(values: Complex) -> Array:
+        out = np.zeros((2, size))
+        out[0, :modes], out[1, :modes] = values.real, values.imag
+        return out
+
+    ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
+    slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
+    compliance = np.empty((2, cells, 4))
+    for row, factor in enumerate((now, recall)):
+        (v0, v1), (d0, d1) = (ends**2 @ factor).real, (2 * ends * slopes @ factor).real
+        compliance[row] = np.stack(
+            [v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1
+        )
+    compliance[0, :, 0] += line.residual[:-1]
+    compliance[0, :, 1] += np.diff(line.residual)
+
+    channel = line.channel_shapes * root
+    weights, feeds = [], []
+    for derivative in derivatives:
+        observe = channel * lam**derivative
+        weights.append(observe)
+        direct = channel * lam if derivative == 2 else 0.0 * channel
+        feeds.append(((observe * now + direct).T, (observe * recall).T))
+    outputs = len(derivatives) * len(channel)
+    channel_weights = np.zeros((2 * size, outputs))
+    channel_feed = np.zeros((2, cells, 4, outputs))
+    if outputs:
+        stacked = np.concatenate(weights)
+        channel_weights[:modes] = stacked.real.T
+        channel_weights[size : size + modes] = -stacked.imag.T
+        for row in range(2):
+            matrix = np.concatenate([feed[row] for feed in feeds], axis=1)
+            channel_feed[row] = (shapes.reshape(-1, modes) @ matrix).real.reshape(cells, 4, outputs)
+    start = np.zeros(size, dtype=np.complex128)
+    start[:modes] = -1 / lam - now - recall
+    return ModalTables(
+        shapes=packed,
+        decay=split(decay),
+        drive=split(decay * now + last - recall),
+        compliance=compliance,
+        channel_weights=channel_weights,
+        channel_feed=channel_feed,
+        start_weights=start,
+        grid_start=line.grid_start,
+        grid_step=line.grid_step,
+        length=line.length,
+    )
+
+
+@dataclass(eq=False)
+class Fleet:
+    """Units that are being stepped: constant matrices padded to common sizes, and their state.
+
+    Units of the same kind share matrices; axles of all units are numbered through.
+
+    Attributes:
+        kind: (U,) index into the matrices. first: (U + 1,) first axle of each unit.
+        transition: (T, S, S). drive: (T, S, A). constant: (T, S).
+        now, before: (T, A, A) m/N, wheelset displacement per new and last forces.
+        wheelsets: (T, A) index of the wheelset displacements. states: (T,) length of the state.
+        linear, hertz: (W,) contact law of every axle.
+        state: (U, S). force, place: (W,) force (N) and position (m) at the last sample.
+        touching: (W,) whether the axle was in contact at the last sample.
+    """
+
+    kind: NDArray[np.int64]
+    first: NDArray[np.int64]
+    transition: Array
+    drive: Array
+    constant: Array
+    now: Array
+    before: Array
+    wheelsets: NDArray[np.int64]
+    states: NDArray[np.int64]
+    linear: Array
+    hertz: Array
+    state: Array
+    force: Array
+    place: Array
+    touching: NDArray[np.bool_]
+
+
+def build_fleet(
+    steps: list[UnitStep],
+    wheelsets: list[NDArray[np.intp]],
+    kind: list[int],
+    law: list[Array],
+    state: list[Array],
+    force: list[Array],
+    place: list[Array],
+) -> Fleet:
+    """Pad matrices of all kinds and gather the units' states.
+
+    Args:
+        steps, wheelsets: discretised unit and wheelset indices of every kind.
+        kind: kind of every unit.
+        law: (2, A) linear stiffness and Hertz factor of the axles of every unit.
+        state, force, place: of every unit at its last sample.
+    """
+    kinds, most = len(steps), max((len(step.constant) for step in steps), default=0)
+    axles = max((len(indices) for indices in wheelsets), default=0)
+    transition = np.zeros((kinds, most, most))
+    drive, constant = np.zeros((kinds, most, axles)), np.zeros((kinds, most))
+    now, before = np.zeros((kinds, axles, axles)), np.zeros((kinds, axles, axles))
+    where = np.zeros((kinds, axles), dtype=np.int64)
+    for i, (step, indices) in enumerate(zip(steps, wheelsets, strict=True)):
+        n, a = len(step.constant), len(indices)
+        transition[i, :n, :n] = step.transition
+        drive[i, :n, :a], constant[i, :n] = step.drive, step.constant
+        now[i, :a, :a], before[i, :a, :a] = step.now[indices], step.before[indices]
+        where[i, :a] = indices
+    padded = np.zeros((len(kind), most))
+    for i, values in enumerate(state):
+        padded[i, : len(values)] = values
+    forces = np.concatenate([np.zeros(0), *force])
+    return Fleet(
+        kind=np.array(kind, dtype=np.int64),
+        first=np.cumsum([0] + [len(wheelsets[k]) for k in kind], dtype=np.int64),
+        transition=transition,
+        drive=drive,
+        constant=constant,
+        now=now,
+        before=before,
+        wheelsets=where,
+        states=np.array([len(step.constant) for step in steps], dtype=np.int64),
+        linear=np.concatenate([np.zeros(0), *(pair[0] for pair in law)]),
+        hertz=np.concatenate([np.zeros(0), *(pair[1] for pair in law)]),
+        state=padded,
+        force=forces,
+        place=np.concatenate([np.zeros(0), *place]),
+        touching=forces > 0,
+    )
+
+
+def march(
+    tables: ModalTables,
+    modal: Array,
+    fleet: Fleet,
+    position: Array,
+    roughness: Array,
+    force: Array,
+    history: Array,
+    feed: Array,
+) -> tuple[int, float]:
+    """Advance by n samples, compiled.
+
+    Args:
+        tables: of the line.
+        modal: (2, K) state y, overwritten.
+        fleet: units on or near the line; their state is overwritten.
+        position: (n, W) m of the fleet's axles.
+        roughness: (n, W) m, irregularity plus wheel defects under them.
+        force: (n, W) N, filled; NaN while off the line.
+        history: (n, 2K) filled with y of every sample.
+        feed: (n, O) filled with the feed-through of the forces to the channel outputs.
+
+    Returns:
+        number of times an axle lost contact on the line, largest equilibrium residual (N).
+    """
+    size = tables.size
+    lost, residual = _march(
+        tables.shapes.reshape(len(tables.shapes), -1),
+        tables.decay,
+        tables.drive,
+        tables.compliance,
+        tables.channel_feed,
+        tables.grid_start,
+        tables.grid_step,
+        tables.length,
+        modal,
+        np.empty((position.shape[1], 2 * size), dtype=tables.shapes.dtype),
+        np.empty((2, size)),
+        fleet.kind,
+        fleet.first,
+        fleet.transition,
+        fleet.drive,
+        fleet.constant,
+        fleet.now,
+        fleet.before,
+        fleet.wheelsets,
+        fleet.states,
+        fleet.linear,
+        fleet.hertz,
+        fleet.state,
+        fleet.force,
+        fleet.place,
+        fleet.touching,
+        np.empty((2, fleet.state.shape[1])),
+        position,
+        roughness,
+        force,
+        history,
+        feed,
+    )
+    return int(lost), float(residual)
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
+def _rail_row(cells, s, shape, modal, size):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(size):
+        re = cells[k] + s * (
+            cells[2 * size + k] + s * (cells[4 * size + k] + s * cells[6 * size + k])
+        )
+        im = cells[size + k] + s * (
+            cells[3 * size + k] + s * (cells[5 * size + k] + s * cells[7 * size + k])
+        )
+        shape[k] = re
+        shape[size + k] = im
+        total += re * modal[0, k] - im * modal[1, k]
+    return total
+
+
+@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
+def _march(  # type: ignore[no-untyped-def]
+    shapes,
+    decay,
+    drive,
+    compliance,
+    channel_feed,
+    grid_start,
+    grid_step,
+    length,
+    modal,
+    shape,
+    load,
+    kind,
+    first,
+    transition,
+    unit_drive,
+    constant,
+    now,
+    before,
+    wheelsets,
+    states,
+    linear,
+    hertz,
+    state,
+    last_force,
+    last_place,
+    touching,
+    scratch,
+    position,
+    roughness,
+    force,
+    history,
+    feed,
+):
+    samples, axles = position.shape
+    size = decay.shape[1]
+    outputs = feed.shape[1]
+    last_cell = shapes.shape[0] - 1
+    lost = 0
+    worst = 0.0
+    for n in range(samples):
+        for k in range(size):
+            history[n, k] = modal[0, k]
+            history[n, size + k] = modal[1, k]
+            load[0, k] = 0.0
+            load[1, k] = 0.0
+        for o in range(outputs):
+            feed[n, o] = 0.0
+        for u in range(kind.size):
+            t = kind[u]
+            begin = first[u]
+            count = first[u + 1] - begin
+            for a in range(count):
+                i = begin + a
+                x = position[n, i]
+                old = last_place[i]
+                on = 0.0 <= x <= length
+                if 0.0 <= old <= length and outputs > 0:
+                    at = (old - grid_start) / grid_step
+                    cell = min(int(at), last_cell)
+                    s = at - cell
+                    for o in range(outputs):
+                        feed[n, o] += last_force[i] * (
+                            channel_feed[1, cell, 0, o]
+                            + s
+                            * (
+                                channel_feed[1, cell, 1, o]
+                                + s
+                                * (channel_feed[1, cell, 2, o] + s * channel_feed[1, cell, 3, o])
+                            )
+                        )
+                own = -now[t, a, a]
+                gap = state[u, wheelsets[t, a]] - roughness[n, i]
+                for b in range(count):
+                    gap += before[t, a, b] * last_force[begin + b]
+                    if b < a:
+                        gap += now[t, a, b] * force[n, begin + b]
+                    elif b > a:
+                        gap += now[t, a, b] * last_force[begin + b]
+                cell = 0
+                s = 0.0
+                if on:
+                    at = (x - grid_start) / grid_step
+                    cell = min(int(at), last_cell)
+                    s = at - cell
+                    gap -= _rail_row(shapes[cell], s, shape[i], modal, size)
+                    own += compliance[0, cell, 0] + s * (
+                        compliance[0, cell, 1]
+                        + s * (compliance[0, cell, 2] + s * compliance[0, cell, 3])
+                    )
+                    if 0.0 <= old <= length:
+                        at = (0.5 * (x + old) - grid_start) / grid_step
+                        middle = min(int(at), last_cell)
+                        m = at - middle
+                        gap -= last_force[i] * (
+                            compliance[1, middle, 0]
+                            + m
+                            * (
+                                compliance[1, middle, 1]
+                                + m * (compliance[1, middle, 2] + m * compliance[1, middle, 3])
+                            )
+                        )
+                f = solve_contact(gap, own, linear[i], hertz[i])
+                force[n, i] = f
+                if on:
+                    miss = abs(f - force_of(gap - own * f, linear[i], hertz[i]))
+                    worst = max(worst, miss)
+                    if touching[i] and f <= 0.0:
+                        lost += 1
+                    touching[i] = f > 0.0
+                    for k in range(size):
+                        load[0, k] += f * shape[i, k]
+                        load[1, k] += f * shape[i, size + k]
+                    for o in range(outputs):
+                        feed[n, o] += f * (
+                            channel_feed[0, cell, 0, o]
+                            + s
+                            * (
+                                channel_feed[0, cell, 1, o]
+                                + s
+                                * (channel_feed[0, cell, 2, o] + s * channel_feed[0, cell, 3, o])
+                            )
+                        )
+            for r in range(states[t]):
+                total = constant[t, r]
+                for c in range(states[t]):
+                    total += transition[t, r, c] * state[u, c]
+                for a in range(count):
+                    total += unit_drive[t, r, a] * force[n, begin + a]
+                scratch[0, r] = total
+            for r in range(states[t]):
+                state[u, r] = scratch[0, r]
+            for a in range(count):
+                i = begin + a
+                last_force[i] = force[n, i]
+                last_place[i] = position[n, i]
+                if not 0.0 <= position[n, i] <= length:
+                    force[n, i] = np.nan
+        for k in range(size):
+            re = modal[0, k]
+            im = modal[1, k]
+            modal[0, k] = (
+                decay[0, k] * re
+                - decay[1, k] * im
+                + drive[0, k] * load[0, k]
+                - drive[1, k] * load[1, k]
+            )
+            modal[1, k] = (
+                decay[0, k] * im
+                + decay[1, k] * re
+                + drive[0, k] * load[1, k]
+                + drive[1, k] * load[0, k]
+            )
+    return lost, worst
+
+
+CHUNK = 64
+"""Samples per call of the compiled kernel, so that the history of the modes stays in the cache."""
+
+FORCE_LIMIT = 1e4
+"""Wheelset force per static load beyond which a run counts as diverged."""
+
+
+class ModalRun:
+    """A run by exponential stepping: the state of modes and units, advanced in chunks.
+
+    Args:
+        line: modes of the line.
+        traffic: the trains.
+        derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+        order: interpolation of forces in time, see :func:`modal_tables`.
+        precision: of the rail shapes.
+        marching: :func:`march` or its readable twin.
+    """
+
+    def __init__(
+        self,
+        line: ModalLine,
+        traffic: Traffic,
+        derivatives: tuple[int, ...],
+        *,
+        order: int = 2,
+        precision: type[np.floating] = np.float64,
+        marching: Callable[..., tuple[int, float]] = march,
+    ) -> None:
+        self.line = line
+        self.traffic = traffic
+        self.tables = modal_tables(
+            line, traffic.step, derivatives, order=order, precision=precision
+        )
+        self.lost_contacts = 0
+        self.equilibrium_residual = 0.0
+        self._order = order
+        self._march = marching
+        self._modal = np.zeros((2, self.tables.size))
+        self._units: list[Running] = []
+        self._fleet: Fleet | None = None
+        self._steps: list[UnitStep] = []
+        self._until = 0
+
+    def reconsider(self) -> None:
+        """Look for units that start, because a train was added."""
+        self._until = 0
+
+    def advance(self, sample: int, time: Array, position: Array) -> tuple[Array, Array]:
+        """Wheelset forces (n, W) N and channel outputs (n, O) of the samples from ``sample`` on.
+
+        Raises:
+            SolverError: a force or a channel diverged.
+        """
+        count = len(time)
+        force = np.full(position.shape, np.nan)
+        outputs = np.empty((count, self.tables.channel_weights.shape[1]))
+        done = 0
+        while done < count:
+            now = sample + done
+            if now >= self._until:
+                self._change_units(self.traffic.active(now), position[done], time[done])
+                self._until = self.traffic.next_change(now)
+            stop = min(count, done + CHUNK, self._until - sample)
+            self._advance_chunk(slice(done, stop), now, time, position, force, outputs)
+            done = stop
+        return force, outputs
+
+    def _advance_chunk(
+        self, part: slice, now: int, time: Array, position: Array, force: Array, outputs: Array
+    ) -> None:
+        assert self._fleet is not None
+        columns = [c for unit in self._units for c in range(unit.columns.start, unit.columns.stop)]
+        place = np.ascontiguousarray(position[part][:, columns])
+        roughness = self.traffic.roughness(self._units, place, time[part])
+        samples = part.stop - part.start
+        own_force = np.empty(place.shape)
+        history = np.empty((samples, 2 * self.tables.size))
+        feed = np.empty((samples, outputs.shape[1]))
+        lost, residual = self._march(
+            self.tables, self._modal, self._fleet, place, roughness, own_force, history, feed
+        )
+        force[part.start : part.stop, columns] = own_force
+        outputs[part] = history @ self.tables.channel_weights + feed
+        self._check(now, time[part], own_force, outputs[part])
+        loads = [unit.unit.static_loads.max() for unit in self._units]
+        self.lost_contacts += lost
+        if loads:
+            self.equilibrium_residual = max(self.equilibrium_residual, residual / max(loads))
+
+    def _check(self, now: int, time: Array, force: Array, outputs: Array) -> None:
+        loads = [unit.unit.static_loads for unit in self._units]
+        if loads:
+            limit = FORCE_LIMIT * np.concatenate(loads)
+            bad = ~np.isfinite(self._fleet.force if self._fleet else 0) | (
+                np.nan_to_num(np.abs(force), nan=0.0) > limit
+            ).any(axis=0)
+            if bad.any():
+                axle = int(np.argmax(bad))
+                value = np.nanmax(np.abs(np.append(force[:, axle], -np.inf)))
+                raise SolverError(
+                    f"force of a wheelset = {value:.3g} N before t = {time[-1]:.6g} s; limit "
+                    f"{limit[axle]:.3g} N: the run diverged, shorten solution.step"
+                )
+        if not np.isfinite(self._modal).all() or not np.isfinite(outputs).all():
+            raise SolverError(
+                f"a mode is not finite before t = {time[-1]:.6g} s (sample {now + len(time)}): "
+                "the run diverged, shorten solution.step"
+            )
+
+    def _change_units(self, active: list[Running], position: Array, time: float) -> None:
+        """Take in units that start now, let go those that have left."""
+        while len(self._steps) < len(self.traffic.kinds):
+            unit = self.traffic.kinds[len(self._steps)]
+            self._steps.append(discretise(unit, self.traffic.step, self._order))
+        kept = {id(unit): index for index, unit in enumerate(self._units)}
+        fresh = [unit for unit in active if id(unit) not in kept]
+        states, forces, places = self._start(fresh, position, time)
+        begun = {id(unit): index for index, unit in enumerate(fresh)}
+        state, force, place = [], [], []
+        for unit in active:
+            if id(unit) in begun:
+                index = begun[id(unit)]
+                state.append(states[index])
+                force.append(forces[index])
+                place.append(places[index])
+            else:
+                assert self._fleet is not None
+                index = kept[id(unit)]
+                axles = slice(self._fleet.first[index], self._fleet.first[index + 1])
+                length = self._fleet.states[self._fleet.kind[index]]
+                state.append(self._fleet.state[index, :length].copy())
+                force.append(self._fleet.force[axles].copy())
+                place.append(self._fleet.place[axles].copy())
+        self._units = active
+        self._fleet = build_fleet(
+            self._steps,
+            [unit.wheelsets for unit in self.traffic.kinds],
+            [unit.kind for unit in active],
+            [unit.law for unit in active],
+            state,
+            force,
+            place,
+        )
+
+    def _start(
+        self, units: list[Running], position: Array, time: float
+    ) -> tuple[list[Array], list[Array], list[Array]]:
+        """Static start of units: state before the sample, forces and places of each."""
+        if not units:
+            return [], [], []
+        places = [position[unit.columns] for unit in units]
+        place = np.concatenate(places)
+        roughness = self.traffic.roughness(units, place[np.newaxis], np.array([time]))[0]
+        shapes = self.line.rail(place)
+        weights = self.line.weights
+        compliance = (shapes * (-weights / self.line.eigenvalues) @ shapes.T).real
+        edges = self.line.grid_start + self.line.grid_step * np.arange(len(self.line.residual))
+        on_line = (place >= 0) & (place <= self.line.length)
+        compliance += np.diag(np.where(on_line, np.interp(place, edges, self.line.residual), 0.0))
+        whole = block_units([unit.unit for unit in units])
+        law = np.concatenate([unit.law for unit in units], axis=1)
+        rest, force = static_start(whole, law, compliance, roughness)
+        if on_line.any():
+            load = (shapes * np.sqrt(weights)).T @ force
+            y = self.tables.start_weights[: len(load)] * load
+            self._modal[0, : len(load)] += y.real
+            self._modal[1, : len(load)] += y.imag
+        states, forces, first, axle = [], [], 0, 0
+        for unit in units:
+            size, axles = len(unit.unit.weight), len(unit.unit.wheelsets)
+            step = self._steps[unit.kind]
+            own = force[axle : axle + axles]
+            state = np.concatenate([rest[first : first + size], np.zeros(size)])
+            states.append(state - (step.now + step.before) @ own)
+            forces.append(own)
+            first += size
+            axle += axles
+        return states, forces, places
