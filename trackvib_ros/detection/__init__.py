@@ -1,1 +1,27 @@
-"""Train detection on streams of waveform blocks: pure NumPy and SciPy."""
+"""Train detection on streams of waveform blocks: pure NumPy and SciPy.
+
+Five lines from arrays::
+
+    from trackvib_ros.detection import Channel, detect
+
+    events = detect(2000.0, samples, [Channel("rail", 0.0, "rail")])
+    passages = [event for event in events if event.kind == "passage"]
+    print(passages[0].values["speed"], passages[0].values["type"])
+"""
+
+from .catalogue import Catalogue, TrainType
+from .detector import DetectorConfig, TrainDetector, detect
+from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent
+
+__all__ = [
+    "CONFIRMED",
+    "VIBRATION",
+    "Catalogue",
+    "Channel",
+    "DetectorConfig",
+    "Estimate",
+    "TrainDetector",
+    "TrainEvent",
+    "TrainType",
+    "detect",
+]

@@ -1,0 +1,333 @@
+"""The train detector: blocks of samples in, events out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from solver import InputError
+from trackvib_ros.waveform import Waveform
+
+from . import report
+from .catalogue import Catalogue
+from .events import Channel, TrainEvent
+from .features import FRAME, GroupStream
+from .onset import Trigger
+from .passage import Record, find_passages
+
+Array = NDArray[np.float64]
+
+_LOOKAHEAD_NS = 30_000_000  # a short hole is closed by samples this far ahead
+_CHUNK_NS = 1_000_000_000
+_BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
+_REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
+_LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """Settings of the detector.
+
+    Attributes:
+        min_speed: lowest speed looked for (m/s).
+        max_speed: highest speed looked for (m/s).
+        hang: quiet time that ends an event (s); longer than the time between two bogies of a car
+            at ``min_speed``.
+        max_event: an event longer than this is a changed noise level, not a train (s).
+        max_lag: a group this far behind the others is taken for silent (s).
+    """
+
+    min_speed: float = 10.0
+    max_speed: float = 115.0
+    hang: float = 2.2
+    max_event: float = 90.0
+    max_lag: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.min_speed < self.max_speed <= 200:
+            raise InputError(
+                f"min_speed = {self.min_speed} m/s and max_speed = {self.max_speed} m/s must obey "
+                "1 <= min_speed < max_speed <= 200"
+            )
+        for name, low, high in (("hang", 0.3, 10), ("max_event", 10, 600), ("max_lag", 0.1, 10)):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(f"{name} = {value} s must lie from {low} to {high} s")
+
+
+class _Group:
+    """One block group: its stream, its trigger, where its channels stand in the detector."""
+
+    def __init__(self, block: Waveform, index: list[int], keep_s: float) -> None:
+        self.stream = GroupStream(block.channels, block.dt_ns, keep_s)
+        self.trigger = Trigger(len(block.channels), self.stream.bands, FRAME * self.stream.step)
+        self.index = index
+        self.next_bin = 0
+        self.restarts = 0
+
+
+@dataclass
+class _Event:
+    start_ns: int
+    triggered: set[int]
+    last_ns: dict[int, int]
+    truncated: bool = False
+    first_ratio: float = 1.0
+
+
+class TrainDetector:
+    """Detects trains in a stream of waveform blocks.
+
+    Memory is bounded by the longest event (:attr:`DetectorConfig.max_event`); the final events of a
+    train come ``hang`` seconds after its last wheelset.
+
+    Args:
+        channels: accelerometers, with positions.
+        catalogue: train types; the shipped one by default.
+        config: settings.
+
+    Raises:
+        InputError: no channel, or a name twice.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[Channel],
+        catalogue: Catalogue | None = None,
+        config: DetectorConfig | None = None,
+    ) -> None:
+        self.channels = tuple(channels)
+        self.catalogue = catalogue or Catalogue.default()
+        self.config = config or DetectorConfig()
+        names = [channel.name for channel in self.channels]
+        if not names:
+            raise InputError("the detector has no channel; give at least one Channel")
+        if len(set(names)) != len(names):
+            raise InputError(f"channel names must differ, not {', '.join(names)}")
+        self._index = {name: i for i, name in enumerate(names)}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, noise floors included: the clock jumped back."""
+        self._groups: dict[tuple[str, ...], _Group] = {}
+        self._start_ns: int | None = None
+        self._done_ns = 0
+        self._event: _Event | None = None
+        self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
+
+    def process(self, block: Waveform) -> list[TrainEvent]:
+        """Take the next block of a group; events that it completes.
+
+        Blocks of one group come in order of time; how samples are cut into blocks does not change
+        the result. Gaps between stamps, and NaN, are dropped samples. Overlaps are cut.
+
+        Raises:
+            InputError: the block does not fit the channels, its shape or its earlier rate.
+        """
+        group = self._group_of(block)
+        if not len(block.data):
+            return []
+        if self._start_ns is None:
+            self._start_ns = self._done_ns = block.stamp_ns
+        group.stream.push(block)
+        return self._run(self._horizon(block.stamp_ns))
+
+    def finish(self) -> list[TrainEvent]:
+        """End of the stream: events of a train still passing, flagged ``truncated_end``."""
+        events = self._run(max((g.stream.end_ns or 0 for g in self._groups.values()), default=0))
+        for group in self._groups.values():
+            group.stream.flush()
+        events += self._frames(2**62)
+        if self._event is not None:
+            now = max((g.stream.end_ns or 0 for g in self._groups.values()), default=0)
+            last = max(self._event.last_ns.values())
+            events += self._close(now, truncated_end=now - last < 300_000_000)
+        return events
+
+    def _group_of(self, block: Waveform) -> _Group:
+        group = self._groups.get(block.channels)
+        if group is None:
+            unknown = [name for name in block.channels if name not in self._index]
+            if unknown:
+                raise InputError(
+                    f"block channel {unknown[0]!r} is not one of the detector's channels "
+                    f"{', '.join(self._index)}; name it when making the detector"
+                )
+            for other in self._groups:
+                twice = set(other) & set(block.channels)
+                if twice:
+                    raise InputError(f"channel {twice.pop()!r} comes in two different groups")
+            if block.dt_ns <= 0 or block.dt_ns > 20_000_000:
+                raise InputError(
+                    f"dt_ns = {block.dt_ns} ns must be positive and at most 20 000 000 ns (50 Hz)"
+                )
+            group = _Group(block, [self._index[n] for n in block.channels], self._keep_s)
+            self._groups[block.channels] = group
+        if block.data.ndim != 2 or block.data.shape[1] != len(block.channels):
+            raise InputError(
+                f"data of shape {block.data.shape} must be (samples, {len(block.channels)} "
+                "channels)"
+            )
+        if block.dt_ns != group.stream.dt_ns:
+            raise InputError(
+                f"dt_ns of {', '.join(block.channels)} changed from {group.stream.dt_ns} to "
+                f"{block.dt_ns} ns; reset the detector for another rate"
+            )
+        return group
+
+    @property
+    def _keep_s(self) -> float:
+        return self.config.max_event + self.config.hang + 5.0
+
+    def _horizon(self, newest_ns: int) -> int:
+        """Time up to which every group that is not silent has come."""
+        lag = round(self.config.max_lag * 1e9)
+        ends = [g.stream.end_ns or 0 for g in self._groups.values()]
+        heard = sum(len(g.index) for g in self._groups.values())
+        if heard < len(self.channels) and self._start_ns is not None:
+            ends.append(self._start_ns)
+        waited = [end for end in ends if newest_ns - end <= lag]
+        return min(waited, default=max(ends))
+
+    def _run(self, horizon_ns: int) -> list[TrainEvent]:
+        events: list[TrainEvent] = []
+        while self._done_ns < horizon_ns:
+            self._done_ns = min(self._done_ns + _CHUNK_NS, horizon_ns)
+            for group in self._groups.values():
+                group.stream.advance(self._done_ns)
+            events += self._frames(self._done_ns - _LOOKAHEAD_NS)
+        return events
+
+    def _frames(self, until_ns: int) -> list[TrainEvent]:
+        """Take the decision frames that end before a time, in order of time over all groups."""
+        ready = []
+        for order, group in enumerate(self._groups.values()):
+            while group.next_bin + FRAME <= group.stream.bins:
+                end_ns, energy, valid = group.stream.frame(group.next_bin)
+                if end_ns > until_ns:
+                    break
+                group.next_bin += FRAME
+                ready.append((end_ns, order, group, energy, valid))
+        ready.sort(key=lambda item: item[:2])
+        events: list[TrainEvent] = []
+        for end_ns, _, group, energy, valid in ready:
+            active = group.trigger.step(energy, valid, frozen=self._event is not None)
+            events += self._decide(end_ns, group, active)
+        return events
+
+    def _decide(self, now_ns: int, group: _Group, active: NDArray[np.bool_]) -> list[TrainEvent]:
+        events: list[TrainEvent] = []
+        for local in np.flatnonzero(active):
+            channel = group.index[local]
+            rested = now_ns - self._active_ns[channel] > _REARM_NS
+            self._active_ns[channel] = now_ns
+            if self._event is None and rested:
+                start = now_ns - round(FRAME * group.stream.step * 1e9)
+                self._event = _Event(start, set(), {})
+                self._event.first_ratio = float(group.trigger.ratio[local])
+                events.append(report.arrival(self.channels[channel], start, self._event.first_ratio))
+            if self._event is not None:
+                self._event.triggered.add(channel)
+                self._event.last_ns[channel] = now_ns
+        if self._event is None:
+            return events
+        last = self._deciding_last(self._event)
+        if now_ns - last > self.config.hang * 1e9:
+            events += self._close(now_ns)
+        elif now_ns - self._event.start_ns > self.config.max_event * 1e9:
+            events += self._close(now_ns, too_long=True)
+            for other in self._groups.values():
+                for local in range(len(other.index)):
+                    other.trigger.relearn(local)
+        return events
+
+    def _deciding_last(self, event: _Event) -> int:
+        """Last activity of the layer nearest to the wheels: a bridge rings on for seconds."""
+        for layer in _LAYER_ORDER:
+            times = [t for c, t in event.last_ns.items() if self.channels[c].layer == layer]
+            if times:
+                return max(times)
+        return event.start_ns
+
+    def _close(
+        self, now_ns: int, truncated_end: bool = False, too_long: bool = False
+    ) -> list[TrainEvent]:
+        event = self._event
+        assert event is not None
+        self._event = None
+        origin = event.start_ns - _BEFORE_NS
+        records = []
+        for group in self._groups.values():
+            for local, channel in enumerate(group.index):
+                window = group.stream.window(local, origin, now_ns)
+                if window.time.size > 50 and np.isfinite(group.trigger.floor[local]).all():
+                    records.append(
+                        Record(self.channels[channel], window, group.trigger.floor[local].copy())
+                    )
+        last = self._deciding_last(event)
+        within = (
+            (event.start_ns - origin) * 1e-9 - 0.5,
+            (last - origin) * 1e-9 + 0.3,
+        )
+        flags = ["truncated_start"] if event.truncated else []
+        flags += ["truncated_end"] if truncated_end else []
+        limits = (self.config.min_speed, self.config.max_speed)
+        found = find_passages(records, within, self.catalogue, limits, event.truncated)
+        return report.closing(self.catalogue, records, origin, within, found, flags)
+
+
+def detect(
+    time_or_rate: float | ArrayLike,
+    samples: ArrayLike,
+    channels: Sequence[Channel] | Channel,
+    catalogue: Catalogue | None = None,
+    config: DetectorConfig | None = None,
+) -> list[TrainEvent]:
+    """Events in plain arrays, in the unit they come in (no result depends on it).
+
+    Args:
+        time_or_rate: sampling rate (Hz), or the time of every sample (s; equal steps, jumps are
+            gaps).
+        samples: shape (samples,) or (samples, channels).
+        channels: one per column.
+
+    Raises:
+        InputError: shapes disagree, or the times do not increase.
+    """
+    data = np.asarray(samples, dtype=np.float64)
+    data = data[:, None] if data.ndim == 1 else data
+    sensors = (channels,) if isinstance(channels, Channel) else tuple(channels)
+    if data.ndim != 2 or data.shape[1] != len(sensors):
+        raise InputError(
+            f"samples of shape {data.shape} must be (samples, {len(sensors)}), one column per "
+            "channel"
+        )
+    names = tuple(channel.name for channel in sensors)
+    detector = TrainDetector(sensors, catalogue, config)
+    clock = np.asarray(time_or_rate, dtype=np.float64)
+    # single precision, as in a Waveform: bring large counts and their offset into range first
+    data = data - np.nanmedian(data, axis=0) if np.isfinite(data).any() else data
+    if clock.ndim == 0:
+        if not 50 <= float(clock) <= 1e6:
+            raise InputError(f"rate = {float(clock)} Hz must lie from 50 Hz to 1 MHz")
+        pieces = [(0, len(data))]
+        dt_ns, start_ns = round(1e9 / float(clock)), np.zeros(1, dtype=np.int64)
+    else:
+        if clock.shape != (len(data),) or len(data) < 2:
+            raise InputError(f"time of shape {clock.shape} must be ({len(data)},), 2 or more")
+        steps = np.diff(clock)
+        if not np.all(steps > 0):
+            raise InputError("time must increase from sample to sample (s)")
+        dt_ns = round(1e9 * float(np.median(steps)))
+        cuts = np.flatnonzero(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) + 1
+        limits = [0, *(int(c) for c in cuts), len(data)]
+        pieces = list(zip(limits[:-1], limits[1:], strict=True))
+        start_ns = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
+    events: list[TrainEvent] = []
+    for (first, last), stamp in zip(pieces, start_ns, strict=True):
+        block = Waveform(int(stamp), dt_ns, names, data[first:last].astype(np.float32))
+        events += detector.process(block)
+    return events + detector.finish()

@@ -1,0 +1,322 @@
+"""From raw blocks to features: gap-safe conditioning, band energies at about 1 kHz, a bounded ring.
+
+Everything here is a recursion over samples, so the result cannot depend on how a stream was cut
+into blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from trackvib_ros.waveform import Waveform
+
+Array = NDArray[np.float64]
+
+BANDS: tuple[tuple[float, float], ...] = ((5.0, 150.0), (20.0, 400.0), (60.0, 800.0))
+"""Frequency bands (Hz) in which energy is measured; the best one is kept per passage."""
+
+FRAME = 10
+"""Bins per decision frame: about 10 ms."""
+
+_BIN_RATE = 1000.0
+_FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
+_SETTLE_S = 0.05  # bins after a hole that the filters still remember
+_MAX_GAP_S = 5.0  # longer gaps restart the stream
+
+
+@dataclass(frozen=True)
+class Window:
+    """Features of one channel over a span of time.
+
+    Attributes:
+        time: centre of every bin, group delay of the filters removed (s after ``origin_ns``),
+            shape (bins,); :attr:`shift` is per band.
+        energy: mean square per band, shape (bins, bands).
+        low: low-passed waveform, shape (bins,).
+        peak: largest magnitude of the raw samples in the bin.
+        flat: samples equal to the one before, per bin.
+        valid: whether the bin holds measured samples only (short holes interpolated).
+        holes: fraction of dropped samples per bin.
+        step: bin length (s).
+        shift: group delay per band (s), to be subtracted from ``time``.
+        bands: frequency limits of the bands (Hz).
+    """
+
+    origin_ns: int
+    time: Array
+    energy: Array
+    low: Array
+    peak: Array
+    flat: Array
+    valid: NDArray[np.bool_]
+    holes: Array
+    step: float
+    shift: Array
+    low_shift: float
+    bands: tuple[tuple[float, float], ...]
+
+
+def bands_for(rate: float) -> tuple[tuple[float, float], ...]:
+    """The bands that a sampling rate (Hz) can show."""
+    usable = [(low, min(high, 0.45 * rate)) for low, high in BANDS]
+    kept = tuple(band for band in usable if band[1] >= 2 * band[0])
+    return kept or ((0.02 * rate, 0.45 * rate),)
+
+
+def _energy_delay(sos: Array, rate: float) -> float:
+    impulse = np.zeros(int(0.5 * rate) + 8)
+    impulse[0] = 1.0
+    power = signal.sosfilt(sos, impulse) ** 2
+    return float(np.sum(np.arange(power.size) * power) / np.sum(power) / rate)
+
+
+class GroupStream:
+    """Channels that share stamps and rate: raw samples in, features in a ring out."""
+
+    def __init__(self, channels: tuple[str, ...], dt_ns: int, keep_s: float) -> None:
+        self.channels = channels
+        self.dt_ns = dt_ns
+        self.rate = 1e9 / dt_ns
+        self.decimation = max(1, int(self.rate // _BIN_RATE))
+        self.step = self.decimation / self.rate
+        self.bands = bands_for(self.rate)
+        self._sos = [
+            signal.butter(2, band, "bandpass", fs=self.rate, output="sos") for band in self.bands
+        ]
+        top = min(100.0, 0.4 * self.rate)
+        bottom = min(0.3, top / 10)
+        self._low_sos = signal.butter(2, (bottom, top), "bandpass", fs=self.rate, output="sos")
+        self.shift = np.array([_energy_delay(sos, self.rate) for sos in self._sos])
+        self.low_shift = _energy_delay(
+            signal.butter(2, top, "lowpass", fs=self.rate, output="sos"), self.rate
+        )
+        self._capacity = int(keep_s / self.step)
+        n = len(channels)
+        columns = len(self.bands) + 5
+        self._ring = np.zeros((2 * self._capacity, n, columns), dtype=np.float32)
+        self._stamps = np.zeros(2 * self._capacity, dtype=np.int64)
+        self._fill = 0
+        self.dropped_bins = 0
+        self.late_samples = 0
+        self.missing_samples = 0
+        self.restarts = 0
+        self._pending: list[Array] = []
+        self._pending_ns = 0
+        self._pending_count = 0
+        self.end_ns: int | None = None
+        self._zi: list[Array] | None = None
+        self._last = np.full(n, np.nan)
+        self._in_hole = np.zeros(n, dtype=bool)
+        self._unsettled = np.zeros(n, dtype=np.int64)
+
+    def push(self, block: Waveform) -> None:
+        """Append a block: overlaps are cut, gaps filled with NaN, long gaps restart the grid."""
+        data = np.asarray(block.data, dtype=np.float64)
+        stamp = block.stamp_ns
+        if self.end_ns is not None:
+            offset = (stamp - self.end_ns) / self.dt_ns
+            if offset <= -0.5:
+                cut = min(len(data), round(-offset))
+                self.late_samples += cut
+                data = data[cut:]
+                stamp += cut * self.dt_ns
+                if not len(data):
+                    return
+            elif offset >= 0.5:
+                missing = round(offset)
+                self.missing_samples += missing
+                if missing / self.rate > _MAX_GAP_S:
+                    self._restart()
+                else:
+                    hole = np.full((missing, data.shape[1]), np.nan)
+                    data = np.concatenate([hole, data])
+                    stamp -= missing * self.dt_ns
+        if not self._pending_count:
+            self._pending_ns = stamp
+        else:
+            # follow the stamps, so that a clock a little off its nominal rate does not pile up
+            self._pending_ns = stamp - self._pending_count * self.dt_ns
+        self._pending.append(data)
+        self._pending_count += len(data)
+        self.end_ns = stamp + len(data) * self.dt_ns
+
+    def _restart(self) -> None:
+        self._consume(self._pending_count, flush=True)
+        self._pending, self._pending_count = [], 0
+        self._zi = None
+        self.restarts += 1
+
+    def advance(self, until_ns: int) -> None:
+        """Turn pending samples before ``until_ns`` into features, whole bins only."""
+        count = min(self._pending_count, (until_ns - self._pending_ns) // self.dt_ns)
+        self._consume(int(count), flush=False)
+
+    def flush(self) -> None:
+        """End of stream: nothing more will fill a hole."""
+        self._consume(self._pending_count, flush=True)
+
+    def _consume(self, count: int, flush: bool) -> None:
+        count -= count % self.decimation
+        if count <= 0:
+            return
+        raw = np.concatenate(self._pending) if len(self._pending) > 1 else self._pending[0]
+        # as far as a hole that starts before ``count`` can matter
+        bad = ~np.isfinite(raw[: count + int(_FILL_S * self.rate) + 2])
+        if bad.any() and not flush:
+            count = self._resolved(bad, count)
+            if count <= 0:
+                self._pending = [raw]
+                return
+        x = raw[:count]
+        unsettled = self._unsettled
+        self._unsettled = np.maximum(unsettled - count, 0)
+        if bad.any():
+            x, holes, invalid = self._fill_holes(raw, bad, count)
+        else:
+            holes = np.zeros((count // self.decimation, x.shape[1]))
+            invalid = holes > 0
+            self._last = x[-1].copy()
+            self._in_hole[:] = False
+        if (unsettled > 0).any():
+            invalid |= np.arange(len(invalid))[:, None] * self.decimation < unsettled
+        self._filter(x, holes, invalid)
+        self._pending = [raw[count:]] if count < len(raw) else []
+        self._pending_ns += count * self.dt_ns
+        self._pending_count -= count
+
+    def _resolved(self, bad: NDArray[np.bool_], count: int) -> int:
+        """Samples that can be conditioned now: a short hole waits for its far end."""
+        limit = int(_FILL_S * self.rate)
+        for column in bad[: count + limit + 1].T:
+            if count <= 0 or not column[count - 1]:
+                continue
+            first = count - 1
+            while first > 0 and column[first - 1]:
+                first -= 1
+            ahead = column[first:]
+            length = len(ahead) if ahead.all() else int(np.argmin(ahead))
+            if length == len(ahead) and length <= limit:
+                count = min(count, first)
+        return count - count % self.decimation
+
+    def _fill_holes(
+        self, raw: Array, bad: NDArray[np.bool_], count: int
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        limit = int(_FILL_S * self.rate)
+        x = raw[:count].copy()
+        invalid = np.zeros((count, x.shape[1]), dtype=bool)
+        for c in range(x.shape[1]):
+            column = bad[:, c]
+            carried, self._in_hole[c] = self._in_hole[c], False
+            if not column[:count].any():
+                self._last[c] = x[-1, c]
+                continue
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], column.view(np.int8), [0]])))
+            for first, last in zip(edges[::2], edges[1::2], strict=True):
+                if first >= count:
+                    break
+                before = x[first - 1, c] if first else self._last[c]
+                if np.isnan(before):
+                    before = raw[last, c] if last < len(column) else 0.0
+                stop = min(last, count)
+                long = last - first > limit or last == len(column) or (carried and first == 0)
+                if not long:
+                    weight = np.arange(1, stop - first + 1) / (last - first + 1)
+                    x[first:stop, c] = before + weight * (raw[last, c] - before)
+                else:
+                    x[first:stop, c] = before
+                    settled = int(_SETTLE_S * self.rate)
+                    invalid[first : stop + settled, c] = True
+                    self._in_hole[c] = stop == count
+                    self._unsettled[c] = max(self._unsettled[c], stop + settled - count)
+            self._last[c] = x[-1, c]
+        shape = (count // self.decimation, self.decimation, x.shape[1])
+        holes = bad[:count].reshape(shape).mean(axis=1)
+        return x, holes, invalid.reshape(shape).any(axis=1)
+
+    def _filter(self, x: Array, holes: Array, invalid: NDArray[np.bool_]) -> None:
+        n, d = len(x) // self.decimation, self.decimation
+        first = self._zi is None
+        if self._zi is None:
+            self._zi = [
+                signal.sosfilt_zi(sos)[:, :, None] * x[0] for sos in (*self._sos, self._low_sos)
+            ]
+            self._previous = np.full(x.shape[1], np.nan)
+        shape = (n, d, x.shape[1])
+        out = np.empty((n, x.shape[1], self._ring.shape[2]), dtype=np.float32)
+        for b, sos in enumerate(self._sos):
+            y, self._zi[b] = signal.sosfilt(sos, x, axis=0, zi=self._zi[b])
+            out[:, :, b] = np.square(y).reshape(shape).mean(axis=1)
+        y, self._zi[-1] = signal.sosfilt(self._low_sos, x, axis=0, zi=self._zi[-1])
+        b = len(self._sos)
+        out[:, :, b] = y.reshape(shape).mean(axis=1)
+        out[:, :, b + 1] = np.abs(x).reshape(shape).max(axis=1)
+        same = np.empty(x.shape, dtype=np.float32)
+        same[0] = x[0] == self._previous
+        same[1:] = x[1:] == x[:-1]
+        self._previous = x[-1].copy()
+        out[:, :, b + 2] = same.reshape(shape).sum(axis=1)
+        out[:, :, b + 3] = ~invalid
+        out[:, :, b + 4] = holes
+        if first:
+            # the band filters start on one sample, whose own departure from the mean must fade
+            fade = int(_SETTLE_S / self.step)
+            out[:fade, :, b + 3] = 0
+        stamps = self._pending_ns + self.dt_ns * (
+            np.arange(n, dtype=np.int64) * d + (d - 1) // 2
+        )
+        self._append(out, stamps)
+
+    def _append(self, out: NDArray[np.float32], stamps: NDArray[np.int64]) -> None:
+        size = 2 * self._capacity
+        position = 0
+        while position < len(out):
+            if self._fill == size:
+                self._ring[: self._capacity] = self._ring[self._capacity :]
+                self._stamps[: self._capacity] = self._stamps[self._capacity :]
+                self._fill = self._capacity
+                self.dropped_bins += self._capacity
+            take = min(len(out) - position, size - self._fill)
+            self._ring[self._fill : self._fill + take] = out[position : position + take]
+            self._stamps[self._fill : self._fill + take] = stamps[position : position + take]
+            self._fill += take
+            position += take
+
+    @property
+    def bins(self) -> int:
+        """Bins made since the start of the stream."""
+        return self.dropped_bins + self._fill
+
+    def frame(self, first_bin: int) -> tuple[int, Array, NDArray[np.bool_]]:
+        """Stamp after the frame (ns), energies (channels, bands) and validity of one frame."""
+        start = first_bin - self.dropped_bins
+        part = self._ring[start : start + FRAME]
+        b = len(self.bands)
+        valid = part[:, :, b + 3].mean(axis=0) > 0.7
+        end = int(self._stamps[start + FRAME - 1]) + round(self.step * 5e8)
+        return end, part[:, :, :b].mean(axis=0, dtype=np.float64), valid
+
+    def window(self, channel: int, from_ns: int, to_ns: int) -> Window:
+        """Features of one channel between two times, as far as the ring still holds them."""
+        stamps = self._stamps[: self._fill]
+        first, last = np.searchsorted(stamps, [from_ns, to_ns])
+        part = self._ring[first:last, channel].astype(np.float64)
+        b = len(self.bands)
+        return Window(
+            origin_ns=from_ns,
+            time=(stamps[first:last] - from_ns) * 1e-9,
+            energy=part[:, :b],
+            low=part[:, b],
+            peak=part[:, b + 1],
+            flat=part[:, b + 2],
+            valid=part[:, b + 3] > 0.5,
+            holes=part[:, b + 4],
+            step=self.step,
+            shift=self.shift,
+            low_shift=self.low_shift,
+            bands=self.bands,
+        )

@@ -1,0 +1,112 @@
+"""Causal energy trigger per channel: short-term energy against a noise floor that is learned.
+
+The short-term average over 1, 4 and 16 frames is compared with the floor in every band. The
+thresholds follow from the chi-square law of the energy of band-limited Gaussian noise: 2 B T degrees
+of freedom in a band of width B over time T (Urkowitz, Proc. IEEE 55, 1967, 523). The floor is frozen
+while an event lasts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+WINDOWS = (1, 4, 16)
+"""Lengths of the short-term averages (frames)."""
+
+_FALSE_ALARM = 1e-10  # per test, Gaussian noise
+_MARGIN = 1.3  # the floor itself is an estimate
+_LEAST_RATIO = 2.0
+_WARM_UP = 50  # frames
+_FLOOR_FRAMES = 800.0  # time constant of the floor
+_FALL_FRAMES = 50.0  # faster downwards: a floor learned inside a train is wrong
+
+
+def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
+    """Energy over floor at which to trigger, shape (windows, bands)."""
+    table = np.empty((len(WINDOWS), len(bands)))
+    for w, frames in enumerate(WINDOWS):
+        for b, (low, high) in enumerate(bands):
+            freedom = max(1.0, 2 * (high - low) * frames * frame_s)
+            table[w, b] = stats.chi2.isf(_FALSE_ALARM, freedom) / freedom
+    return np.maximum(_MARGIN * table, _LEAST_RATIO)
+
+
+class Trigger:
+    """Noise floor and activity of the channels of one group, frame by frame."""
+
+    def __init__(
+        self, channels: int, bands: tuple[tuple[float, float], ...], frame_s: float
+    ) -> None:
+        self.thresholds = thresholds(bands, frame_s)
+        shape = (channels, len(bands))
+        self.floor = np.full(shape, np.nan)
+        self.ratio = np.zeros(channels)
+        self.active = np.zeros(channels, dtype=bool)
+        self.seen = np.zeros(channels, dtype=np.int64)
+        self.fall_db = np.zeros(channels)
+        self._history = np.zeros((WINDOWS[-1], *shape))
+        self._filled = np.zeros(channels, dtype=np.int64)
+        self._warm = np.full((_WARM_UP, *shape), np.nan)
+        self._first_floor = np.full(shape, np.nan)
+
+    def ready(self) -> NDArray[np.bool_]:
+        """Which channels have learned a floor."""
+        return self.seen >= _WARM_UP
+
+    def step(
+        self, energy: Array, valid: NDArray[np.bool_], frozen: bool
+    ) -> NDArray[np.bool_]:
+        """Take one frame of energies (channels, bands); say which channels are active.
+
+        Invalid frames leave floor and history untouched. ``frozen`` holds the floor.
+        """
+        usable = valid & np.all(energy > 0, axis=1)
+        if usable.all():
+            self._history[1:] = self._history[:-1]
+            self._history[0] = energy
+        else:
+            self._history[1:, usable] = self._history[:-1, usable]
+            self._history[0, usable] = energy[usable]
+        self._filled[usable] += 1
+        learning = usable & (self.seen < _WARM_UP)
+        if learning.any():
+            for c in np.flatnonzero(learning):
+                self._warm[self.seen[c], c] = energy[c]
+                self.seen[c] += 1
+                if self.seen[c] == _WARM_UP:
+                    self.floor[c] = np.median(self._warm[:, c], axis=0)
+                    self._first_floor[c] = self.floor[c]
+        ready = self.seen >= _WARM_UP
+        if not ready.any():
+            return self.active
+        with np.errstate(invalid="ignore"):
+            excess = np.zeros(len(ready))
+            for w, frames in enumerate(WINDOWS):
+                mean = self._history[:frames].mean(axis=0)
+                np.maximum(
+                    excess, np.nanmax(mean / self.floor / self.thresholds[w], axis=1, initial=0.0),
+                    out=excess,
+                )
+        self.ratio = np.where(usable & ready, excess, 0.0)
+        self.active = self.ratio > 1.0
+        learn = usable & ready & ~self.active
+        slow = energy[learn] / self.floor[learn]
+        if not frozen:
+            weight = np.where(slow > 1, 1 / _FLOOR_FRAMES, 1 / _FLOOR_FRAMES)
+            quiet = self._history[:, learn].mean(axis=0) / self.floor[learn]
+            weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, weight)
+            self.floor[learn] *= np.maximum(1 + weight * (np.minimum(slow, 4.0) - 1), 0.5)
+            self.fall_db[learn] = np.max(
+                10 * np.log10(self._first_floor[learn] / self.floor[learn]), axis=1
+            )
+        return self.active
+
+    def relearn(self, channel: int) -> None:
+        """Forget the floor of a channel."""
+        self.seen[channel] = 0
+        self._first_floor[channel] = np.nan
+        self.active[channel] = False

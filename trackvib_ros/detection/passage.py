@@ -1,0 +1,385 @@
+"""One finished event: which train, when, how fast, from everything the rail channels show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .axles import AxleFit, fit_axles
+from .catalogue import Catalogue, TrainType
+from .events import Channel
+from .features import Window
+from .kinematics import Motion, robust_scale
+from .pattern import Match, Trace, scan
+
+Array = NDArray[np.float64]
+
+CONFIRM_SCORE = 0.60
+"""Least pattern correlation of a confirmed train."""
+
+KNOWN_SCORE = 0.70
+"""Least pattern correlation at which a catalogue type is named."""
+
+_POSTERIOR_TEMPER = 0.7  # residuals of neighbouring wheelsets are not quite independent
+_SCORE_WEIGHT = 120.0
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of one channel in an event: features and noise floor per band."""
+
+    channel: Channel
+    window: Window
+    floor: Array
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One catalogue type in one orientation and direction, fitted to all rail channels."""
+
+    train: TrainType
+    reverse: bool
+    direction: int
+    score: float
+    fit: AxleFit
+    probability: float = 0.0
+
+    @property
+    def places(self) -> Array:
+        """Distance of every wheelset behind the first (m)."""
+        return self.train.oriented(self.reverse)
+
+    @property
+    def mid_time(self) -> float:
+        """Time at which the middle of the train passes the reference point (s)."""
+        return float(self.fit.motion.time_at(0.5 * self.train.span))
+
+
+@dataclass(frozen=True)
+class Passage:
+    """The hypotheses about one train, most probable first; empty if no pattern was found.
+
+    Attributes:
+        interval: first and last strong energy at the reference channel (s).
+        traces: rail channels used, reference first, in the band that was kept.
+        direction: +1, -1, or 0 if unknown.
+        clock_offset: (channel, offset s, sigma s) for channels whose clock contradicts the motion.
+        delay: speed by the delays between two channels (m/s), sigma; or None.
+    """
+
+    interval: tuple[float, float]
+    traces: tuple[Trace, ...]
+    band: tuple[float, float]
+    hypotheses: tuple[Hypothesis, ...]
+    direction: int
+    clock_offset: tuple[tuple[str, float, float], ...] = ()
+    delay: tuple[float, float] | None = None
+    quality: tuple[str, ...] = ()
+
+    @property
+    def score(self) -> float:
+        """Pattern correlation of the best hypothesis."""
+        return self.hypotheses[0].score if self.hypotheses else 0.0
+
+
+def traces_of(record: Record, within: tuple[float, float]) -> list[Trace]:
+    """One trace per band, quiet outside an interval (s)."""
+    window = record.window
+    return [
+        Trace(
+            record.channel.name,
+            record.channel.x,
+            window.time - window.shift[b],
+            window.energy[:, b],
+            window.valid,
+            float(record.floor[b]),
+            window.step,
+            (within[0] - 0.3, within[1] + 0.3),
+        )
+        for b in range(len(window.bands))
+    ]
+
+
+def smoothed(trace: Trace, width_s: float) -> Array:
+    """Energy averaged over ``width_s`` about every bin."""
+    return trace.mean(trace.time - width_s / 2, trace.time + width_s / 2)
+
+
+def strong(trace: Trace, bandwidth: float, within: tuple[float, float]) -> NDArray[np.bool_]:
+    """Bins whose 40 ms energy stands out of the noise and within 12 dB of the strong ones."""
+    energy = smoothed(trace, 0.04)
+    inside = (trace.time >= within[0]) & (trace.time <= within[1])
+    if not inside.any():
+        return inside
+    top = float(np.percentile(energy[inside], 95))
+    freedom = max(2 * bandwidth * 0.04, 2.0)
+    limit = max(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top / 16)
+    return np.asarray(inside & (energy > limit))
+
+
+def strong_interval(
+    trace: Trace, bandwidth: float, within: tuple[float, float]
+) -> tuple[float, float] | None:
+    """First and last strong energy (s)."""
+    found = np.flatnonzero(strong(trace, bandwidth, within))
+    if found.size < 2:
+        return None
+    return float(trace.time[found[0]]), float(trace.time[found[-1]])
+
+
+def quiet_gaps(
+    trace: Trace, bandwidth: float, interval: tuple[float, float], least_s: float
+) -> list[tuple[float, float]]:
+    """Stretches without strong energy, at least ``least_s`` long, inside an interval."""
+    times = trace.time[strong(trace, bandwidth, interval)]
+    if times.size < 2:
+        return []
+    gaps = np.diff(times)
+    return [
+        (float(times[i]), float(times[i + 1])) for i in np.flatnonzero(gaps > least_s)
+    ]
+
+
+@dataclass(frozen=True)
+class _Scanned:
+    trace: Trace
+    band: tuple[float, float]
+    interval: tuple[float, float]
+    matches: list[Match]
+
+    @property
+    def score(self) -> float:
+        return self.matches[0].score if self.matches else 0.0
+
+
+def _scan_channel(
+    record: Record,
+    within: tuple[float, float],
+    trains: Sequence[TrainType],
+    limits: tuple[float, float],
+    truncated: bool,
+) -> _Scanned | None:
+    best: _Scanned | None = None
+    for trace, band in zip(traces_of(record, within), record.window.bands, strict=True):
+        interval = strong_interval(trace, band[1] - band[0], within)
+        if interval is None:
+            continue
+        stretch = (0.3, 1.25) if truncated else (0.80, 1.25)
+        matches = scan(trace, interval, trains, limits, stretch)
+        found = _Scanned(trace, band, interval, matches)
+        if best is None or found.score > best.score:
+            best = found
+    return best
+
+
+def _motion(match: Match) -> Motion:
+    return Motion(
+        match.epoch,
+        -match._distance(match.start),
+        match.speed,
+        match.acceleration,
+        np.diag([1.0, 1.0, 1.0]),
+    )
+
+
+def _recentred(match: Match) -> Motion:
+    times = match.times()
+    return _motion(match).moved(float(0.5 * (times[0] + times[-1])))
+
+
+def find_passage(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    trains: Sequence[TrainType],
+    limits: tuple[float, float],
+    truncated: bool = False,
+) -> Passage | None:
+    """The train in an interval of time, from its rail channels (reference = first by score).
+
+    Args:
+        records: rail channels.
+        within: the event (s).
+        trains: candidate types.
+        limits: lowest and highest speed (m/s).
+        truncated: the record starts inside the train.
+    """
+    scanned = [
+        found
+        for record in records
+        if (found := _scan_channel(record, within, trains, limits, truncated)) is not None
+    ]
+    if not scanned:
+        return None
+    scanned.sort(key=lambda s: s.trace.x)
+    top = max(s.score for s in scanned)
+    usable = [s for s in scanned if s.score > max(top - 0.25, 0.3)] or [
+        max(scanned, key=lambda s: s.score)
+    ]
+    reference = usable[0]
+    interval = reference.interval
+    if not reference.matches:
+        return Passage(interval, tuple(s.trace for s in usable), reference.band, (), 0)
+    return _fit_hypotheses(usable, reference)
+
+
+def _direction(
+    usable: Sequence[_Scanned], best: Match
+) -> tuple[int, list[_Scanned], list[tuple[str, float, float]]]:
+    """Direction from the order of the channels; channels whose clock fits neither direction."""
+    starts: dict[str, float] = {}
+    for s in usable:
+        for match in s.matches:
+            if match.train.name == best.train.name and match.reverse == best.reverse:
+                starts[s.trace.name] = float(np.median(match.times() - best.times()))
+    reference = usable[0]
+    votes = []
+    offsets: list[tuple[str, float, float]] = []
+    kept = [reference]
+    for s in usable[1:]:
+        if s.trace.name not in starts:
+            continue
+        baseline = s.trace.x - reference.trace.x
+        delay = starts[s.trace.name]
+        if abs(baseline) < 0.5:
+            kept.append(s)
+            continue
+        expected = baseline / best.speed
+        error = min((abs(delay - sign * expected), sign) for sign in (1, -1))
+        tolerance = max(1.2 / best.speed, 0.06 * abs(expected))
+        if error[0] < tolerance:
+            votes.append(error[1])
+            kept.append(s)
+        else:
+            offsets.append((s.trace.name, delay - expected, 0.5 / best.speed))
+    if not votes or abs(sum(votes)) != len(votes):
+        return 0, [reference] if votes else kept, offsets
+    return votes[0], kept, offsets
+
+
+def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
+    best = reference.matches[0]
+    direction, kept, offsets = _direction(usable, best)
+    table: dict[tuple[str, bool], list[float]] = {}
+    for s in kept:
+        for match in s.matches:
+            table.setdefault((match.train.name, match.reverse), []).append(match.score)
+    hypotheses: list[Hypothesis] = []
+    for match in reference.matches:
+        score = sum(table[match.train.name, match.reverse]) / len(kept)
+        if score < best.score - 0.25:
+            continue
+        places = match.train.oriented(match.reverse)
+        sign = direction or 1
+        shifts = [sign * (s.trace.x - reference.trace.x) for s in kept]
+        fit = fit_axles([s.trace for s in kept], [places + d for d in shifts], _recentred(match))
+        if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
+            continue
+        hypotheses.append(Hypothesis(match.train, match.reverse, direction, score, fit))
+    hypotheses = ranked(hypotheses)
+    passage = Passage(
+        interval=reference.interval,
+        traces=tuple(s.trace for s in kept),
+        band=reference.band,
+        hypotheses=tuple(hypotheses),
+        direction=direction,
+        clock_offset=tuple(offsets),
+        quality=("unsynchronised",) if offsets else (),
+    )
+    if hypotheses and direction:
+        passage = replace(passage, delay=delay_speed(passage))
+    return passage
+
+
+def ranked(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Hypotheses with their probabilities, most probable first.
+
+    The profile likelihood of Gaussian residuals, N ln(scale), and the pattern correlation.
+    """
+    if not hypotheses:
+        return []
+    least = min(h.fit.scale for h in hypotheses)
+    top = max(h.score for h in hypotheses)
+    logs = []
+    for h in hypotheses:
+        count = int(h.fit.observed.sum())
+        log = -_POSTERIOR_TEMPER * count * np.log(h.fit.scale / least)
+        logs.append(log - _SCORE_WEIGHT * max(0.0, top - h.score - 0.01))
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    out = [replace(h, probability=float(p)) for h, p in zip(hypotheses, weights, strict=True)]
+    return sorted(out, key=lambda h: -h.probability)
+
+
+def delay_speed(passage: Passage) -> tuple[float, float] | None:
+    """Mean speed (m/s, sigma) at mid-train from wheelset delays between the outer two channels.
+
+    Needs the pairing of wheelsets only, not their spacing: independent of the catalogue.
+    """
+    best = passage.hypotheses[0]
+    if len(passage.traces) < 2:
+        return None
+    fit = best.fit
+    x = np.array([trace.x for trace in passage.traces])
+    a, b = int(np.argmin(x)), int(np.argmax(x))
+    both = fit.used[a] & fit.used[b]
+    if both.sum() < 4 or x[b] - x[a] < 0.5:
+        return None
+    delay = np.abs(fit.time[b, both] - fit.time[a, both])
+    expected = np.abs(
+        fit.motion.time_at(best.places[both] + passage.direction * (x[b] - passage.traces[0].x))
+        - fit.motion.time_at(best.places[both] + passage.direction * (x[a] - passage.traces[0].x))
+    )
+    ratio = delay / expected
+    centre = float(np.median(ratio))
+    spread = max(robust_scale(ratio - centre, 1), 1e-6)
+    good = np.abs(ratio - centre) < 4 * spread
+    mean = float(ratio[good].mean())
+    sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
+    speed = float(fit.motion.speed_at(best.mid_time))
+    return speed / mean, speed * sigma / mean**2
+
+
+def _excited(record: Record, within: tuple[float, float]) -> bool:
+    """Whether a channel shows energy well above its floor in an interval, on enough valid bins."""
+    inside = (record.window.time >= within[0]) & (record.window.time <= within[1])
+    inside &= record.window.valid
+    if inside.sum() < 50:
+        return False
+    strongest = np.percentile(record.window.energy[inside], 98, axis=0)
+    return bool(np.max(strongest / record.floor) > 3.0)
+
+
+def find_passages(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    catalogue: Catalogue,
+    limits: tuple[float, float],
+    truncated: bool = False,
+) -> list[Passage]:
+    """Every train in an event, in order of time: where there is a pause, one or two are tried."""
+    rails = [r for r in records if r.channel.layer == "rail" and _excited(r, within)]
+    if not rails:
+        return []
+    whole = find_passage(rails, within, catalogue.types, limits, truncated)
+    if whole is None:
+        return []
+    trace = whole.traces[0]
+    bandwidth = whole.band[1] - whole.band[0]
+    gaps = quiet_gaps(trace, bandwidth, within, 0.6)
+    if whole.score > 0.8 or not gaps:
+        return [whole]
+    best, parts = whole.score + 0.05, [whole]
+    for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:4]:
+        middle = 0.5 * (gap[0] + gap[1])
+        left = find_passages(rails, (within[0], middle), catalogue, limits, truncated)
+        right = find_passages(rails, (middle, within[1]), catalogue, limits)
+        if not left or not right:
+            continue
+        scores = [part.score for part in (*left, *right)]
+        mean = sum(scores) / len(scores)
+        if min(scores) >= CONFIRM_SCORE and mean > best:
+            best, parts = mean, [*left, *right]
+    return parts

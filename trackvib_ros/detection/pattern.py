@@ -1,0 +1,308 @@
+"""Where in a record a known axle pattern lies: the scan over type, speed and acceleration.
+
+The log-energy of a rail channel, resampled from time to distance for a trial speed and
+acceleration, is compared with the comb of a train's wheelsets by the normalised correlation of both
+after the same band-pass in space. All offsets come from one Fourier transform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from .catalogue import TrainType
+from .kinematics import MAX_ACCELERATION
+
+Array = NDArray[np.float64]
+
+DYNAMIC_RANGE = 300.0
+"""Energy range below the strong axles that counts (25 dB)."""
+
+_CELL = 0.5  # m
+_BACKGROUND = 8.0  # m, what is smoother than this is no axle pattern
+
+
+class Trace:
+    """Band energy of one rail channel in an event, averaged over any interval of time.
+
+    Args:
+        name: channel.
+        x: position (m).
+        time: centres of the bins (s), group delay removed.
+        energy: mean square per bin, shape (bins,).
+        valid: bins that hold measured samples.
+        floor: noise floor of the energy.
+        step: bin length (s).
+        within: interval of interest (s); outside it the trace is quiet.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        x: float,
+        time: Array,
+        energy: Array,
+        valid: NDArray[np.bool_],
+        floor: float,
+        step: float,
+        within: tuple[float, float] = (-np.inf, np.inf),
+    ) -> None:
+        self.name, self.x, self.time, self.step = name, x, time, step
+        self.valid = valid
+        known = np.flatnonzero(valid)
+        if known.size == 0:
+            filled = np.full(energy.shape, floor)
+        else:
+            filled = np.interp(np.arange(energy.size), known, energy[known])
+        outside = (time < within[0]) | (time > within[1])
+        if outside.any():
+            filled = np.where(outside, floor, filled)
+            known = np.flatnonzero(valid & ~outside)
+        self.energy = filled
+        strong = float(np.percentile(filled[known], 97)) if known.size else floor
+        self.noise = floor
+        self.base = max(floor, strong / DYNAMIC_RANGE, 1e-300)
+        # a stream with a gap of several seconds has unequal bins: integrate over real time
+        edges = np.concatenate([time - step / 2, time[-1:] + step / 2])
+        widths = np.diff(edges)
+        self._edges = edges
+        self._sum = np.concatenate([[0.0], np.cumsum(filled * widths)])
+        self._known = np.concatenate([[0.0], np.cumsum(valid * widths)])
+
+    def mean(self, start: Array, stop: Array) -> Array:
+        """Mean energy between two times (s); :attr:`noise` outside the record."""
+        total = np.interp(stop, self._edges, self._sum) - np.interp(start, self._edges, self._sum)
+        low, high = self._edges[0], self._edges[-1]
+        length = np.clip(stop, low, high) - np.clip(start, low, high)
+        return np.where(length > 0, total / np.maximum(length, 1e-12), self.noise)
+
+    def level(self, start: Array, stop: Array) -> Array:
+        """ln of the mean energy over :attr:`base`, not below 0."""
+        return np.log(np.maximum(self.mean(start, stop) / self.base, 1.0))
+
+    def coverage(self, start: Array, stop: Array) -> Array:
+        """Fraction of an interval that was measured."""
+        total = np.interp(stop, self._edges, self._known)
+        total = total - np.interp(start, self._edges, self._known)
+        return np.asarray(total / np.maximum(stop - start, 1e-12))
+
+
+@dataclass(frozen=True)
+class Match:
+    """A pattern in a trace: the first wheelset passes at ``start`` (s); v and a there at ``epoch``.
+
+    ``score`` is the normalised correlation, 1 for a perfect comb.
+    """
+
+    score: float
+    train: TrainType
+    reverse: bool
+    start: float
+    epoch: float
+    speed: float
+    acceleration: float
+
+    def times(self) -> Array:
+        """Passing time of every wheelset (s)."""
+        places = self.train.oriented(self.reverse) + self._distance(self.start)
+        root = np.sqrt(np.maximum(self.speed**2 + 2 * self.acceleration * places, 1e-6))
+        return self.epoch + 2 * places / (self.speed + root)
+
+    def _distance(self, time: float) -> float:
+        t = time - self.epoch
+        return self.speed * t + 0.5 * self.acceleration * t * t
+
+
+def _weights(n: int, sigma: float) -> Array:
+    k = 2 * np.pi * np.arange(n // 2 + 1) / (n * _CELL)
+    fine = np.exp(-0.5 * (k * sigma) ** 2)
+    return np.asarray(fine - np.exp(-0.5 * (k * _BACKGROUND) ** 2))
+
+
+def _comb(places: Array, n: int) -> Array:
+    comb = np.zeros(n)
+    cell = places / _CELL
+    first = np.floor(cell).astype(int)
+    np.add.at(comb, first, 1 - (cell - first))
+    np.add.at(comb, first + 1, cell - first)
+    return comb
+
+
+def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: int) -> Array:
+    """Levels on the distance grid, shape (speeds, n); the grid is centred on the epoch."""
+    edges = (np.arange(n + 1) - n / 2) * _CELL
+    v = speed[:, None]
+    square = v * v + 2 * acceleration * edges
+    reachable = square > 0.01 * v * v
+    root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
+    times = epoch + 2 * edges / (v + root)
+    level = trace.level(times[:, :-1], times[:, 1:])
+    return np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0)
+
+
+def _scan_once(
+    trace: Trace,
+    epoch: float,
+    duration: float,
+    trains: Sequence[tuple[TrainType, bool]],
+    ranges: Sequence[tuple[float, float]],
+    speeds: Array,
+    acceleration: float,
+    sigma: float,
+) -> list[Match]:
+    """Best match of every train for one acceleration."""
+    best: list[Match] = []
+    found: dict[int, Match] = {}
+    chunk = 24
+    for first in range(0, speeds.size, chunk):
+        part = speeds[first : first + chunk]
+        wanted = [
+            j
+            for j, (low, high) in enumerate(ranges)
+            if low <= part[-1] and high >= part[0]
+        ]
+        if not wanted:
+            continue
+        longest = max(trains[j][0].span for j in wanted)
+        extent = max(part[-1] * duration + 2 * _BACKGROUND, longest + 4 * _BACKGROUND)
+        n = int(fft.next_fast_len(int(extent / _CELL) + 1, real=True))
+        weights = _weights(n, sigma)
+        signal = fft.rfft(_resample(trace, epoch, part, acceleration, n), axis=1) * weights
+        norm = np.sqrt(np.sum(np.abs(signal) ** 2, axis=1) * 2 / n)
+        for j in wanted:
+            train, reverse = trains[j]
+            rows = np.flatnonzero((part >= ranges[j][0]) & (part <= ranges[j][1]))
+            if rows.size == 0:
+                continue
+            comb = fft.rfft(_comb(train.oriented(reverse), n)) * weights
+            size = np.sqrt(np.sum(np.abs(comb) ** 2) * 2 / n)
+            scores = fft.irfft(signal[rows] * np.conj(comb), n, axis=1)
+            scores /= np.maximum(norm[rows, None] * size, 1e-30)
+            row, offset = np.unravel_index(int(np.argmax(scores)), scores.shape)
+            score = float(scores[row, offset])
+            if j in found and found[j].score >= score:
+                continue
+            place = (offset + 0.5 - n / 2) * _CELL
+            if place > n / 2 * _CELL - train.span:
+                place -= n * _CELL
+            v = float(part[rows[row]])
+            square = max(v * v + 2 * acceleration * place, 0.01 * v * v)
+            start = epoch + 2 * place / (v + np.sqrt(square))
+            found[j] = Match(score, train, reverse, float(start), epoch, v, acceleration)
+    best.extend(found.values())
+    return best
+
+
+def _grid(low: float, high: float, step: float) -> Array:
+    count = max(1, int(np.ceil(np.log(high / low) / step)) + 1)
+    return np.geomspace(low, high, count)
+
+
+def _accelerations(duration: float, step_m: float) -> Array:
+    """Accelerations whose bend over the duration differs by ``step_m`` (m) at the ends."""
+    step = 32 * step_m / duration**2
+    count = int(MAX_ACCELERATION / step)
+    return step * np.arange(-count, count + 1)
+
+
+def scan(
+    trace: Trace,
+    interval: tuple[float, float],
+    trains: Sequence[TrainType],
+    limits: tuple[float, float],
+    stretch: tuple[float, float] = (0.80, 1.25),
+    keep: int = 8,
+) -> list[Match]:
+    """Best matches of the types in a trace, at most one per type and orientation, best first.
+
+    Args:
+        trace: the rail channel.
+        interval: first and last strong energy (s); gives the speeds to try.
+        trains: candidate types.
+        limits: lowest and highest speed (m/s).
+        stretch: speeds tried, as fractions of span / duration of the interval.
+        keep: how many to refine.
+    """
+    start, stop = interval
+    duration = max(stop - start, 0.2)
+    epoch = 0.5 * (start + stop)
+    oriented = [
+        (train, reverse)
+        for train in trains
+        for reverse in ((False,) if train.symmetric else (False, True))
+    ]
+    ranges = []
+    for train, _ in oriented:
+        v = train.span / duration
+        ranges.append((max(limits[0], v * stretch[0]), min(limits[1], v * stretch[1])))
+    usable = [j for j, (low, high) in enumerate(ranges) if high > low]
+    if not usable:
+        return []
+    oriented = [oriented[j] for j in usable]
+    ranges = [ranges[j] for j in usable]
+    low = min(r[0] for r in ranges)
+    high = max(r[1] for r in ranges)
+    coarse = 1.8
+    best: dict[tuple[str, bool], Match] = {}
+    speed_step = 0.016
+    bends = _accelerations(duration, 2.0)
+    for acceleration in bends:
+        for match in _scan_once(
+            trace,
+            epoch,
+            duration,
+            oriented,
+            ranges,
+            _grid(low, high, speed_step),
+            float(acceleration),
+            coarse,
+        ):
+            key = (match.train.name, match.reverse)
+            if key not in best or match.score > best[key].score:
+                best[key] = match
+    top = sorted(best.values(), key=lambda m: -m.score)[:keep]
+    bend = float(bends[1] - bends[0]) if bends.size > 1 else 0.0
+    return sorted(
+        (_refine(trace, match, duration, speed_step, bend) for match in top),
+        key=lambda m: -m.score,
+    )
+
+
+def _refine(
+    trace: Trace, match: Match, duration: float, speed_step: float, bend: float
+) -> Match:
+    """Finer speeds, accelerations and smoothing about a coarse match."""
+    best = Match(
+        -1.0,
+        match.train,
+        match.reverse,
+        match.start,
+        match.epoch,
+        match.speed,
+        match.acceleration,
+    )
+    for sigma, spread, points in ((1.1, 1.0, 4), (0.7, 0.35, 3)):
+        centre = best if best.score > 0 else match
+        offsets = np.linspace(-spread, spread, 2 * points + 1)
+        bends = [0.0] if bend == 0 else list(spread * bend * np.linspace(-1, 1, 5))
+        speeds = centre.speed * (1 + speed_step * offsets)
+        limit = [(0.5 * centre.speed, 2 * centre.speed)]
+        level = -1.0
+        for offset in bends:
+            for found in _scan_once(
+                trace,
+                centre.epoch,
+                duration,
+                [(match.train, match.reverse)],
+                limit,
+                speeds,
+                centre.acceleration + float(offset),
+                sigma,
+            ):
+                if found.score > level:
+                    best, level = found, found.score
+    return best
