@@ -175,6 +175,17 @@ class Structure:
         """Rows of the rail's deflection at ``x`` (m): (len(x), N)."""
         return self.rows("rail", x)
 
+    def missing_rail_compliance(self, x: Array) -> Array:
+        """Static point compliance of the rail at ``x`` (m) that no coordinate carries (m/N)."""
+        field, section = self.fields["rail"], beam_sections(self.scenario.track)["rail"]
+        index = np.clip(np.searchsorted(field.left, x, side="right") - 1, 0, None)
+        value = np.empty(len(x))
+        for number in np.unique(index):
+            chosen, element = index == number, field.elements[number]
+            at = np.clip(x[chosen] - field.left[number], 0, element.length)
+            value[chosen] = element.missing_compliance(at, section)
+        return value
+
     def probe(self, channel: Channel) -> Probe:
         """Rows of a channel: motion, strain, fastening force (whole row), bearing force.
 
@@ -503,7 +514,9 @@ def _beds(
     def bed(stiffness: str) -> Array:
         over, under = track.bed_on_bridge, track.bed_on_subgrade
         value = np.where(
-            on_bridge, getattr(over, stiffness) * over.width, getattr(under, stiffness) * under.width
+            on_bridge,
+            getattr(over, stiffness) * over.width,
+            getattr(under, stiffness) * under.width,
         )
         return np.asarray(value * weight * _factor(track, f"bed.{stiffness}", x))
 

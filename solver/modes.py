@@ -31,7 +31,7 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 1
+FORMAT = 2
 CACHE_BYTES = 2 * 2**30
 
 REAL_MARGIN = 1.5
@@ -210,6 +210,7 @@ def build_modal_line(structure: Structure) -> ModalLine:
         )[0]
     at = structure.rail_rows(np.clip(edges, 0, structure.length))
     static = point_compliance(structure, at)
+    static += structure.missing_rail_compliance(np.clip(edges, 0, structure.length))
     shapes = (at @ real) @ vectors
     return ModalLine(
         eigenvalues=values,
