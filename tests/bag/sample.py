@@ -25,9 +25,7 @@ TYPES = {
 
 def topic(name: str) -> Topic:
     qos = Qos(durability="transient_local" if name == LATCHED else "volatile")
-    return Topic(
-        name, TYPES[name], message_definition(TYPES[name]), type_hash(TYPES[name]), (qos,)
-    )
+    return Topic(name, TYPES[name], message_definition(TYPES[name]), type_hash(TYPES[name]), (qos,))
 
 
 def store() -> Any:
@@ -73,7 +71,9 @@ def text_cdr(types: Any, text: str) -> bytes:
 
 def write_sample(directory: Path, blocks: int = 100, **options: Any) -> Path:
     types = store()
-    writer = BagWriter(directory, custom_data={"scenario": "speed = 83.3\n", "seed": "7"}, **options)
+    writer = BagWriter(
+        directory, custom_data={"scenario": "speed = 83.3\n", "seed": "7"}, **options
+    )
     for name in TYPES:
         writer.add_topic(topic(name))
     writer.write(LATCHED, START_NS, START_NS + 5, text_cdr(types, "speed = 83.3"))

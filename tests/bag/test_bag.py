@@ -57,7 +57,7 @@ def test_topics_metadata_and_custom_data(bag: Path) -> None:
 
 def test_existing_directory_is_refused(bag: Path) -> None:
     before = sorted(p.name for p in bag.iterdir())
-    with pytest.raises(InputError, match="not overwritten.*-o"):
+    with pytest.raises(InputError, match=r"not overwritten.*-o"):
         BagWriter(bag)
     assert sorted(p.name for p in bag.iterdir()) == before
 

@@ -154,14 +154,21 @@ def _finish_active(path: Path) -> FileReport:
     if final.exists():
         raise InputError(f"{path} and {final.name} exist both: move one of them away")
     found = scan(path)
-    messages = found.index.statistics().message_count
-    gaps = [str(gap) for gap in found.gaps]
-    if not _cut_is_enough(found):
+    if _cut_is_enough(found):
+        _cut_and_finish(path, found)
+        path.rename(final)
+        messages = found.index.statistics().message_count
+        report = FileReport(final.name, messages, [str(gap) for gap in found.gaps])
+    else:
         report = _rewrite(path, final, found)
-        kept = path.rename(path.with_name(final.name + DAMAGED_SUFFIX))
-        metadata.sync_directory(path.parent)
-        report.kept_as = kept.name
-        return report
+        report.kept_as = path.rename(path.with_name(final.name + DAMAGED_SUFFIX)).name
+    metadata.sync_directory(path.parent)
+    if not report.gaps and not found.closed:
+        report.gaps.append("the recording was not closed; at most its last second is missing")
+    return report
+
+
+def _cut_and_finish(path: Path, found: Scan) -> None:
     with path.open("r+b") as file:
         file.truncate(found.clean_end)
         file.seek(found.clean_end)
@@ -170,11 +177,6 @@ def _finish_active(path: Path) -> FileReport:
         file.write(end + found.index.summary(found.clean_end + len(end)))
         file.flush()
         os.fsync(file.fileno())
-    path.rename(final)
-    metadata.sync_directory(path.parent)
-    if not gaps and not found.closed:
-        gaps = ["the recording was not closed; at most its last second is missing"]
-    return FileReport(final.name, messages, gaps)
 
 
 def _cut_is_enough(found: Scan) -> bool:

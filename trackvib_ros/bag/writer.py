@@ -206,6 +206,8 @@ class BagWriter:
                 while batch:
                     self._add(*batch[0])
                     batch.popleft()
+                    if self._file.open_bytes >= CHUNK_BYTES:
+                        self._flush()
                 if time.monotonic() - last_flush >= self._flush_interval:
                     last_flush = time.monotonic()
                     self._flush()
@@ -228,8 +230,6 @@ class BagWriter:
             self._define(file, self._topics[topic], number)
         file.add_message(number, log_time, publish_time, data)
         self._first_log_time = min(self._first_log_time, log_time)
-        if file.open_bytes >= CHUNK_BYTES:
-            self._flush()
 
     def _split_due(self, log_time: int) -> bool:
         if self._first_log_time > log_time:
