@@ -22,7 +22,7 @@ TOLERANCE = 1e-12
 
 def hertz_constant(wheel_radius: float) -> float:
     """G (m/N^(2/3)) of one wheel of the given radius (m)."""
-    return 3.86e-8 * wheel_radius**-0.115
+    return float(3.86e-8 * wheel_radius**-0.115)
 
 
 def wheelset_law(contact: Contact, wheel_radius: float) -> tuple[float, float]:
@@ -32,7 +32,7 @@ def wheelset_law(contact: Contact, wheel_radius: float) -> tuple[float, float]:
     return 0.0, 2.0 / hertz_constant(wheel_radius) ** 1.5
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[untyped-decorator]
 def force_of(compression: float, linear: float, hertz: float) -> float:
     """Wheelset force (N) at a compression (m)."""
     if hertz == 0.0:
@@ -42,7 +42,7 @@ def force_of(compression: float, linear: float, hertz: float) -> float:
     return hertz * compression * math.sqrt(compression)
 
 
-@njit(cache=True, inline="always", error_model="numpy")
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[untyped-decorator]
 def solve_contact(gap: float, compliance: float, linear: float, hertz: float) -> float:
     """Force F (N) with F = law(gap - compliance * F).
 

@@ -47,40 +47,32 @@ _TBT3352 = (
     (0.0474, 1.9784e-2, 1.3643),
     (0.1533, 3.9488e-4, 3.4516),
 )
-_ISO3095_LEVEL = (17.1, 15.0, 13.0, 11.0, 9.0, 7.0, 4.9, 2.9, 0.9, -1.1, -3.2) + (
-    -5.0,
-    -5.6,
-    -6.2,
-    -6.8,
-    -7.4,
-    -8.0,
-    -8.6,
-    -9.2,
-    -9.8,
-    -10.4,
-    -11.0,
-)  # dB re 1 um, third octaves from 0.4 m downwards
+# dB re 1 um, third octaves from 0.4 m downwards
+_ISO3095_LEVEL = (
+    *(17.1, 15.0, 13.0, 11.0, 9.0, 7.0, 4.9, 2.9, 0.9, -1.1, -3.2),
+    *(-5.0, -5.6, -6.2, -6.8, -7.4, -8.0, -8.6, -9.2, -9.8, -10.4, -11.0),
+)
 
 
 def spectrum(irregularity: Irregularity, wavenumber: ArrayLike) -> Array:
     """One-sided power spectral density S(k) (m^2/(rad/m)) at wavenumbers (rad/m)."""
-    k = np.asarray(wavenumber, dtype=np.float64)
+    k: Array = np.asarray(wavenumber, dtype=np.float64)
     name = irregularity.spectrum
     if name == "sato":
-        return irregularity.roughness_coefficient / k**3
+        return np.asarray(irregularity.roughness_coefficient / k**3)
     if name == "german_low":
         cut, slow = 0.8246**2, 0.0206**2
-        return 4.032e-7 * cut / ((k**2 + slow) * (k**2 + cut))
+        return np.asarray(4.032e-7 * cut / ((k**2 + slow) * (k**2 + cut)))
     if name == "tbt3352":
         f = k / (2 * math.pi)
         edges, factors, powers = (np.array(column) for column in zip(*_TBT3352, strict=True))
         piece = np.searchsorted(edges, f, side="right") - 1
-        return factors[piece] * f ** -powers[piece] * 1e-6 / (2 * math.pi)
+        return np.asarray(factors[piece] * f ** -powers[piece] * 1e-6 / (2 * math.pi))
     if name == "iso3095":
         centres = 0.4 * 10 ** (-0.1 * np.arange(len(_ISO3095_LEVEL)))
         level = np.interp(np.log(2 * math.pi / k), np.log(centres[::-1]), _ISO3095_LEVEL[::-1])
         bandwidth = k * (10**0.05 - 10**-0.05)
-        return 1e-12 * 10 ** (level / 10) / bandwidth
+        return np.asarray(1e-12 * 10 ** (level / 10) / bandwidth)
     raise ValueError("the irregularity has no spectrum")
 
 
@@ -102,12 +94,12 @@ def wavelengths(irregularity: Irregularity) -> tuple[float, float] | None:
     return None
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _hermite(x: Array, start: float, step: float, value: Array, slope: Array, out: Array) -> None:
     last = value.size - 2
     for i in range(x.size):
         place = (x[i] - start) / step
-        cell = min(max(int(math.floor(place)), 0), last)
+        cell = min(max(math.floor(place), 0), last)
         t = min(max(place - cell, 0.0), 1.0)
         s = 1.0 - t
         out[i] = s * s * ((1.0 + 2.0 * t) * value[cell] + t * step * slope[cell]) + t * t * (
@@ -250,7 +242,7 @@ def build_profile(irregularity: Irregularity, start: float, end: float, length: 
             f"irregularity: {(end - start):g} m in steps of {step:g} m are {last - first} points; "
             "at most 50 million: raise irregularity.wavelength_min or shorten the line"
         )
-    x = step * np.arange(first, last + 1)
+    x: Array = step * np.arange(first, last + 1, dtype=np.float64)
     value, slope = np.zeros(x.size), np.zeros(x.size)
     if irregularity.spectrum is not None:
         value, slope = _realisation(irregularity, x, step, length)

@@ -35,35 +35,38 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LANES = 16
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+"""Freedoms given to the compiler; not-a-number and infinity keep their meaning."""
+
 SLOW = 0.05
 """Modes that decay below this factor within one step are given forces linear in the step."""
 
 
-def exponential_weights(
-    eigenvalues: Complex, step: float, order: int
-) -> tuple[Complex, Complex, Complex, Complex]:
+def exponential_weights(eigenvalues: Complex, step: float, order: int) -> tuple[Complex, ...]:
     """E, a, b, c of the step ``q = E q' + a p + b p' + c p''`` (all (K,); a, b, c in s).
 
     With the functions phi_j(z) = (phi_{j-1}(z) - 1/(j-1)!)/z, phi_0 = exp, the integral of
     exp(lambda (h - t)) (t/h)^j over the step is h j! phi_{j+1}(lambda h).
     """
-    z = eigenvalues * step
-    decay = np.exp(z)
+    z: Complex = eigenvalues * step
+    decay: Complex = np.exp(z)
     phi = [decay]
     with np.errstate(divide="ignore", invalid="ignore"):
         for j in range(1, 4):
             phi.append((phi[-1] - 1 / math.factorial(j - 1)) / z)
     small = np.abs(z) < 0.7
     for j in range(1, 4):
-        series = sum(z**m / math.factorial(m + j) for m in range(18))
+        series = np.zeros_like(z)
+        for m in range(18):
+            series += z**m / math.factorial(m + j)
         phi[j] = np.where(small, series, phi[j])
     constant, linear, quadratic = step * phi[1], step * phi[2], 2 * step * phi[3]
     if order == 1:
         return decay, linear, constant - linear, np.zeros_like(decay)
+    now, before = (quadratic + linear) / 2, (quadratic - linear) / 2
+    last = constant - quadratic
     slow = np.abs(decay) < SLOW
-    now = np.where(slow, linear, (quadratic + linear) / 2)
-    last = np.where(slow, constant - linear, constant - quadratic)
-    before = np.where(slow, 0.0, (quadratic - linear) / 2)
+    now[slow], last[slow], before[slow] = linear[slow], (constant - linear)[slow], 0.0
     return decay, now, last, before
 
 
@@ -328,8 +331,8 @@ def march(
     return int(lost), float(residual)
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-def _rail_row(cells, s, shape, modal, size):  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=FASTMATH, error_model="numpy")  # type: ignore[untyped-decorator]
+def _rail_row(cells, s, shape, modal, size):
     total = 0.0
     for k in range(size):
         re = cells[k] + s * (
@@ -344,8 +347,8 @@ def _rail_row(cells, s, shape, modal, size):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-def _march(  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=FASTMATH, error_model="numpy")  # type: ignore[untyped-decorator]
+def _march(
     shapes,
     decay,
     drive,
@@ -379,7 +382,7 @@ def _march(  # type: ignore[no-untyped-def]
     history,
     feed,
 ):
-    samples, axles = position.shape
+    samples = position.shape[0]
     size = decay.shape[1]
     outputs = feed.shape[1]
     last_cell = shapes.shape[0] - 1
@@ -621,15 +624,15 @@ class ModalRun:
         states, forces, places = self._start(fresh, position, time)
         begun = {id(unit): index for index, unit in enumerate(fresh)}
         state, force, place = [], [], []
-        for unit in active:
-            if id(unit) in begun:
-                index = begun[id(unit)]
+        for running in active:
+            if id(running) in begun:
+                index = begun[id(running)]
                 state.append(states[index])
                 force.append(forces[index])
                 place.append(places[index])
             else:
                 assert self._fleet is not None
-                index = kept[id(unit)]
+                index = kept[id(running)]
                 axles = slice(self._fleet.first[index], self._fleet.first[index + 1])
                 length = self._fleet.states[self._fleet.kind[index]]
                 state.append(self._fleet.state[index, :length].copy())

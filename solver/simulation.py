@@ -127,7 +127,7 @@ class Simulation:
             SolverError: the computation left its valid range.
         """
         index = self._index
-        time = (index + np.arange(samples)) * self.step_ns * 1e-9
+        time: Array = (index + np.arange(samples, dtype=np.float64)) * (self.step_ns * 1e-9)
         position = self._traffic.position(time)
         force, signals = self._run.advance(index, time, position)
         self._index += samples
