@@ -1,0 +1,176 @@
+"""The train detector as a lifecycle node: waveforms in, events out, optionally all recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from solver import InputError
+from trackvib_ros import messages as m
+from trackvib_ros.detection import TrainEvent
+from trackvib_ros.intake import Intake
+from trackvib_ros.outbox import Outbox
+from trackvib_ros.process import Setting, Stop, declare, main, value
+from trackvib_ros.recorder import Recorder
+
+TEXTS = Parameter.Type.STRING_ARRAY
+NUMBERS = Parameter.Type.DOUBLE_ARRAY
+SETTINGS = (
+    Setting("autostart", False, "configure and activate at once", read_only=True),
+    Setting(
+        "channel_names", TEXTS, "accelerometers; unset: from topic channels", fixed=True
+    ),
+    Setting("channel_positions", NUMBERS, "their x along the track [m]", fixed=True),
+    Setting("channel_layers", TEXTS, "rail, slab, support_layer or bridge; each", fixed=True),
+    Setting("channel_topics", TEXTS, "waveform topic of each", fixed=True),
+    Setting("best_effort", False, "subscribe to best-effort publishers too", fixed=True),
+    Setting("record_directory", "", "record all topics to this new bag; empty: no", fixed=True),
+)
+
+
+class DetectorNode(LifecycleNode):  # type: ignore[misc]
+    """Configure reads the parameters, activate listens, deactivate says what is left to say."""
+
+    def __init__(self, stop: Stop, **arguments: Any) -> None:
+        super().__init__("detector", **arguments)
+        self.failure: str | None = None
+        self.done = False
+        self._intake: Intake | None = None
+        self._channels: dict[str, list[m.Channel]] = {}
+        self._description: Any = None
+        self._inputs: list[Any] = []
+        self._recorder: Recorder | None = None
+        self._outbox = Outbox(self)
+        declare(self, SETTINGS)
+        for topic in (m.DIAGNOSTICS, m.TRAIN_EVENTS, m.TRAIN_OCCUPIED, m.TRAIN_SPEED):
+            self._outbox.open(topic)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the channels, or wait for their description; create the bag."""
+        try:
+            names = value(self, "channel_names")
+            if names:
+                self._channels = m.channels_by_topic(
+                    names,
+                    value(self, "channel_positions"),
+                    value(self, "channel_layers"),
+                    value(self, "channel_topics"),
+                )
+            if value(self, "record_directory"):
+                directory = Path(value(self, "record_directory"))
+                self._recorder = Recorder(self, directory, use_sim_time=True)
+                self._recorder.start()
+        except (InputError, OSError) as failure:
+            self.failure = str(failure)
+            self.get_logger().error(self.failure)
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe."""
+        if self._channels:
+            self._listen(self._channels)
+        else:
+            self._description = self.create_subscription(
+                m.CHANNELS.type, m.CHANNELS.name, self._on_channels, m.CHANNELS.qos
+            )
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening; a train still passing is reported as far as it was seen."""
+        if self._description is not None:
+            self.destroy_subscription(self._description)
+            self._description = None
+        self._be_quiet()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Finish the bag."""
+        if self._recorder is not None:
+            self._outbox.acknowledged(1.0)
+            self._recorder.close()
+            if self._recorder.failure:
+                self.failure = self._recorder.failure
+                self.get_logger().error(self.failure)
+        self._recorder = None
+        self._channels = {}
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Finish everything."""
+        return self.on_cleanup(state)
+
+    def work(self) -> float:
+        """Nothing but callbacks; returns how long to wait for them (s)."""
+        self._outbox.flush()
+        return 1.0
+
+    def _on_channels(self, message: DiagnosticArray) -> None:
+        try:
+            channels = m.read_channels(message)
+        except InputError as failure:
+            self.get_logger().error(str(failure))
+            return
+        if self._intake is None or channels != self._channels:
+            self._be_quiet()
+            self._channels = channels
+            self._listen(channels)
+
+    def _be_quiet(self) -> None:
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs.clear()
+        if self._intake is not None:
+            self._publish(self._intake.finish())
+        self._intake = None
+
+    def _listen(self, channels: dict[str, list[m.Channel]]) -> None:
+        self._intake = Intake(channels)
+        qos = m.BEST_EFFORT_STREAM if value(self, "best_effort") else m.STREAM
+        for topic in channels:
+
+            def take(message: m.PointCloud2, topic: str = topic) -> None:
+                if self._intake is not None:
+                    self._publish(self._intake.take(topic, message))
+
+            self._inputs.append(self.create_subscription(m.PointCloud2, topic, take, qos))
+
+    def _publish(self, events: list[TrainEvent]) -> None:
+        for event in events:
+            self._outbox.put(m.TRAIN_EVENTS, m.event_message(event))
+            occupied, speed = m.occupied_message(event), m.speed_message(event)
+            if occupied is not None:
+                self._outbox.put(m.TRAIN_OCCUPIED, occupied)
+            if speed is not None:
+                self._outbox.put(m.TRAIN_SPEED, speed)
+        self._outbox.flush()
+
+    def _report(self) -> None:
+        components = []
+        if self._intake is not None:
+            silent = [topic for topic in self._channels if not self.count_publishers(topic)]
+            components.append(("input", *self._intake.state(silent)))
+        elif self._description is not None:
+            components.append(("input", f"waiting for topic {m.CHANNELS.name}", {}))
+        else:
+            components.append(("input", None, {"state": "not active"}))
+        if self._recorder is not None:
+            components.append(("recorder", *self._recorder_state(self._recorder)))
+        stamp = self.get_clock().now().nanoseconds
+        self._outbox.put(m.DIAGNOSTICS, m.diagnostics_message(stamp, self.get_name(), components))
+
+    def _recorder_state(self, recorder: Recorder) -> tuple[str | None, dict[str, object]]:
+        drops = sum(recorder.drops.values())
+        warning = recorder.failure or (f"{drops} messages lost" if drops else None)
+        counts = {f"recorded {topic}": n for topic, n in recorder.counts.items()}
+        return warning, {"bag": recorder.directory, "lost": drops, **counts}
+
+
+if __name__ == "__main__":
+    main(DetectorNode)

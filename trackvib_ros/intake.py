@@ -1,0 +1,154 @@
+"""What comes in is checked, counted and put in order before the detector sees it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from solver import InputError
+from trackvib_ros.detection import Channel, TrainDetector, TrainEvent
+from trackvib_ros.messages import read_waveform
+from trackvib_ros.waveform import Waveform
+
+RESTART_BLOCKS = 3
+"""So many blocks in sequence, all in the past, mean that the source has started anew."""
+
+LARGEST = 1e6
+"""Magnitude from which a sample is no acceleration of a track but damage (m/s²)."""
+
+
+class _Source:
+    """One topic: where its time stands, and late blocks that may turn out to be a restart."""
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        self.names = {channel.name for channel in channels}
+        self.frame: str | None = None
+        self.next_ns: int | None = None
+        self.run = 0
+        self.late: list[Waveform] = []
+
+
+class Intake:
+    """Feeds a detector from waveform messages of several topics, whatever they contain.
+
+    A gap is passed on (the detector counts it as dropped samples); a block of the past is dropped,
+    unless it begins a restart: then the detector finishes and forgets.
+
+    Args:
+        channels: the accelerometers by topic.
+
+    Attributes:
+        blocks: blocks accepted, by topic.
+        refused: blocks refused, by ``topic: reason``.
+        last_refusal: the whole sentence of the last refusal.
+        gaps: gaps in the stamps, by topic.
+        missing_ns: simulated time missing in those gaps, by topic (ns).
+        restarts: times that the sources started anew.
+    """
+
+    def __init__(self, channels: dict[str, list[Channel]]) -> None:
+        self.detector = TrainDetector([c for group in channels.values() for c in group])
+        self.blocks: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.last_refusal = ""
+        self.gaps: Counter[str] = Counter()
+        self.missing_ns: Counter[str] = Counter()
+        self.restarts = 0
+        self._sources = {topic: _Source(group) for topic, group in channels.items()}
+
+    def take(self, topic: str, message: Any) -> list[TrainEvent]:
+        """Events that the next message of a topic completes; never raises for what it contains."""
+        source = self._sources[topic]
+        try:
+            block = _cleaned(read_waveform(message))
+            if set(block.channels) - source.names or not block.channels:
+                raise _Refusal(
+                    "unknown channels", f"channels {block.channels}, not {sorted(source.names)}"
+                )
+            if source.frame is not None and block.frame_id != source.frame:
+                raise _Refusal("wrong frame", f'frame "{block.frame_id}", not "{source.frame}"')
+            return self._accept(topic, source, block)
+        except _Refusal as refusal:
+            self._refuse(topic, refusal.kind, str(refusal))
+        except (InputError, ValueError, TypeError, OverflowError) as error:
+            self._refuse(topic, "malformed", str(error))
+        return []
+
+    def finish(self) -> list[TrainEvent]:
+        """End of the stream: what the detector still has to say; it forgets everything."""
+        events = self.detector.finish()
+        self.detector.reset()
+        for source in self._sources.values():
+            source.next_ns = None
+        return events
+
+    def state(self, silent: Sequence[str]) -> tuple[str | None, dict[str, object]]:
+        """Warning, if any, and figures for diagnostics; ``silent`` topics have no publisher."""
+        refused = sum(self.refused.values())
+        warnings = [f"no publisher on {', '.join(silent)}"] if silent else []
+        if refused:
+            warnings.append(f"{refused} blocks refused, the last: {self.last_refusal}")
+        if self.gaps:
+            warnings.append(f"{sum(self.missing_ns.values()) * 1e-9:.3f} s missing in gaps")
+        figures: dict[str, object] = {"restarts": self.restarts, "refused": refused}
+        figures |= {f"blocks {topic}": n for topic, n in self.blocks.items()}
+        figures |= {f"refused {reason}": n for reason, n in self.refused.items()}
+        figures |= {f"gaps {topic}": n for topic, n in self.gaps.items()}
+        return "; ".join(warnings) or None, figures
+
+    def _accept(self, topic: str, source: _Source, block: Waveform) -> list[TrainEvent]:
+        if source.next_ns is None or block.stamp_ns >= source.next_ns:
+            for late in source.late:
+                self._refuse(topic, "in the past", f"stamp {late.stamp_ns} ns is in the past")
+            source.late = []
+            return self._process(topic, source, block)
+        if source.late and block.stamp_ns != source.late[-1].end_ns:
+            self._refuse(topic, "in the past", f"stamp {source.late[0].stamp_ns} ns is in the past")
+            source.late = []
+        source.late.append(block)
+        if len(source.late) < RESTART_BLOCKS:
+            return []
+        held, source.late, source.next_ns = source.late, [], None
+        source.run += 1
+        events: list[TrainEvent] = []
+        if source.run > self.restarts:
+            self.restarts = source.run
+            events += self.detector.finish()
+            self.detector.reset()
+        for late in held:
+            events += self._process(topic, source, late)
+        return events
+
+    def _process(self, topic: str, source: _Source, block: Waveform) -> list[TrainEvent]:
+        if source.run < self.restarts and source.next_ns is not None:
+            return []  # remainder of the run before the restart
+        if source.next_ns is not None and block.stamp_ns > source.next_ns:
+            self.gaps[topic] += 1
+            self.missing_ns[topic] += block.stamp_ns - source.next_ns
+        events = self.detector.process(block)
+        source.next_ns, source.frame = block.end_ns, block.frame_id
+        source.run = max(source.run, self.restarts)
+        self.blocks[topic] += 1
+        return events
+
+    def _refuse(self, topic: str, kind: str, reason: str) -> None:
+        self.refused[f"{topic}: {kind}"] += 1
+        self.last_refusal = f"{topic}: {reason}"
+
+
+class _Refusal(Exception):
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind = kind
+
+
+def _cleaned(block: Waveform) -> Waveform:
+    """Infinite and absurd samples become dropped ones."""
+    bad = ~(np.abs(block.data) <= LARGEST)
+    if not bad.any():
+        return block
+    data = np.where(bad, np.float32(np.nan), block.data)
+    return Waveform(block.stamp_ns, block.dt_ns, block.channels, data, block.frame_id)
