@@ -15,16 +15,14 @@ from trackvib_ros import messages as m
 from trackvib_ros.detection import TrainEvent
 from trackvib_ros.intake import Intake
 from trackvib_ros.outbox import Outbox
-from trackvib_ros.process import Setting, Stop, declare, main, value
+from trackvib_ros.process import Setting, Stop, declare, main, transition, value
 from trackvib_ros.recorder import Recorder
 
 TEXTS = Parameter.Type.STRING_ARRAY
 NUMBERS = Parameter.Type.DOUBLE_ARRAY
 SETTINGS = (
     Setting("autostart", False, "configure and activate at once", read_only=True),
-    Setting(
-        "channel_names", TEXTS, "accelerometers; unset: from topic channels", fixed=True
-    ),
+    Setting("channel_names", TEXTS, "accelerometers; unset: from topic channels", fixed=True),
     Setting("channel_positions", NUMBERS, "their x along the track [m]", fixed=True),
     Setting("channel_layers", TEXTS, "rail, slab, support_layer or bridge; each", fixed=True),
     Setting("channel_topics", TEXTS, "waveform topic of each", fixed=True),
@@ -51,6 +49,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             self._outbox.open(topic)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    @transition
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the channels, or wait for their description; create the bag."""
         try:
@@ -72,6 +71,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
+    @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe."""
         if self._channels:
@@ -82,6 +82,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             )
         return super().on_activate(state)
 
+    @transition
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; a train still passing is reported as far as it was seen."""
         if self._description is not None:
@@ -90,6 +91,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         self._be_quiet()
         return super().on_deactivate(state)
 
+    @transition
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish the bag."""
         if self._recorder is not None:
@@ -102,6 +104,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         self._channels = {}
         return super().on_cleanup(state)
 
+    @transition
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Finish everything."""
         return self.on_cleanup(state)

@@ -6,10 +6,12 @@ signal only asks the loop to end.
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
@@ -22,8 +24,9 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.exceptions import ParameterUninitializedException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -144,7 +147,28 @@ def declare(node: LifecycleNode, settings: Sequence[Setting]) -> None:
 
 def value(node: Node, name: str) -> Any:
     """Value of a declared parameter, None while unset."""
-    return node.get_parameter(name).value
+    try:
+        return node.get_parameter(name).value
+    except ParameterUninitializedException:
+        return None
+
+
+Transition = Callable[[Any, LifecycleState], TransitionCallbackReturn]
+
+
+def transition(callback: Transition) -> Transition:
+    """A lifecycle callback whose unforeseen errors are told; rclpy alone swallows them."""
+
+    @functools.wraps(callback)
+    def told(node: Any, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return callback(node, state)
+        except Exception as error:
+            node.failure = f"{callback.__name__}: {error!r}"
+            node.get_logger().error(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+
+    return told
 
 
 def run(create: Callable[[Stop], Any], arguments: Sequence[str] | None = None) -> int:
@@ -160,10 +184,10 @@ def run(create: Callable[[Stop], Any], arguments: Sequence[str] | None = None) -
     executor.add_node(node)
     try:
         if value(node, "autostart"):
-            for transition in (node.trigger_configure, node.trigger_activate):
+            for trigger in (node.trigger_configure, node.trigger_activate):
                 if stop:
                     return 0
-                if transition() != TransitionCallbackReturn.SUCCESS:
+                if trigger() != TransitionCallbackReturn.SUCCESS:
                     return 0 if stop else 2
         while not stop and not node.done:
             wait = node.work()

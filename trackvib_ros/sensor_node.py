@@ -12,7 +12,16 @@ from std_srvs.srv import Trigger
 
 from solver import InputError, Scenario, SolverError, load_scenario
 from trackvib_ros import messages as m
-from trackvib_ros.process import Interrupted, Setting, Stop, declare, in_background, main, value
+from trackvib_ros.process import (
+    Interrupted,
+    Setting,
+    Stop,
+    declare,
+    in_background,
+    main,
+    transition,
+    value,
+)
 from trackvib_ros.run import Run
 from trackvib_ros.station import Station, reseeded
 
@@ -61,6 +70,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         ):
             self.create_service(Trigger, f"~/{name}", self._answer(command))
 
+    @transition
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the scenario, assemble the model, create the topics."""
         self.failure = None
@@ -93,11 +103,13 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         self._run.recorders = value(self, "await_recorders")
         self._run.pace.factor = value(self, "real_time_factor")
 
+    @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run."""
         self._active = True
         return super().on_activate(state)
 
+    @transition
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Pause in simulated time."""
         self._active = False
@@ -105,6 +117,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
             self._run.hold()
         return super().on_deactivate(state)
 
+    @transition
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free model and topics."""
         self._active = False
@@ -113,6 +126,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         self._run = None
         return super().on_cleanup(state)
 
+    @transition
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free everything; the node is of no use afterwards."""
         return self.on_cleanup(state)
