@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import importlib
 import struct
+import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,16 @@ from solver import InputError
 from trackvib_ros.bag import BagWriter, Qos, Topic, message_definition
 from trackvib_ros.bag.metadata import INFINITE_NS
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 INFRASTRUCTURE = ("/parameter_events", "/rosout")
 """Topics that every node has."""
 CLOCK = "/clock"
+SCENARIO = "scenario"
+"""Last part of the topic whose text (TOML) is copied to the custom data of the bag."""
 
 _BEST_EFFORT_DEPTH = 2000
 _DISCOVERY_PERIOD_S = 0.1
@@ -116,6 +124,7 @@ class Recorder:
         self._sim_ns: int | None = None
         self._held: deque[_Arrival] = deque()
         self._held_bytes = 0
+        self._scenario = b""
         self._lost: Counter[str] = Counter()
         self._sources: dict[str, _Source] = {}
         self._group = _PolledGroup()
@@ -257,7 +266,7 @@ class Recorder:
                 )
             )
         subscription = self._node.create_subscription(
-            _message_class(types[0]),
+            message_class(types[0]),
             name,
             _never_called,
             _matching_qos(p.qos_profile for p in publishers),
@@ -313,6 +322,9 @@ class Recorder:
             self._store(arrival, now)
 
     def _store(self, arrival: _Arrival, log_time_ns: int) -> None:
+        if arrival.topic.rpartition("/")[2] == SCENARIO and arrival.data != self._scenario:
+            self._scenario = arrival.data
+            self._writer.add_custom_data(_scenario_data(arrival.data))
         self._writer.write(arrival.topic, log_time_ns, arrival.source_ns, arrival.data)
 
     def _hold(self, arrival: _Arrival) -> None:
@@ -332,7 +344,8 @@ def _never_called(_data: bytes, _info: object) -> None:
     """Two arguments make rclpy hand out the message info."""
 
 
-def _message_class(type_name: str) -> Any:
+def message_class(type_name: str) -> Any:
+    """Return the installed class of ``package/msg/Type``; raises :class:`InputError` if none."""
     package, _, name = type_name.partition("/msg/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
@@ -370,3 +383,27 @@ def _clock_ns(cdr: bytes) -> int:
     """Return the time of a serialized ``rosgraph_msgs/Clock``; byte 1 tells the byte order."""
     seconds, nanoseconds = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _scenario_data(cdr: bytes) -> dict[str, str]:
+    """Return the custom data of a serialized ``std_msgs/String`` that holds a scenario."""
+    (size,) = struct.unpack_from("<I" if cdr[1] & 1 else ">I", cdr, 4)
+    text = cdr[8 : 7 + size].decode("utf-8", "replace")
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return {"scenario": text}
+    seeds = ", ".join(f"{path} = {value}" for path, value in _seeds(content, ""))
+    return {"scenario": text, "seed": seeds}
+
+
+def _seeds(value: object, path: str) -> Iterator[tuple[str, object]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if key == "seed":
+                yield f"{path}seed", inner
+            else:
+                yield from _seeds(inner, f"{path}{key}.")
+    elif isinstance(value, list):
+        for number, inner in enumerate(value):
+            yield from _seeds(inner, f"{path[:-1]}[{number}].")

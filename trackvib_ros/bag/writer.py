@@ -85,6 +85,7 @@ class BagWriter:
         self.counts: Counter[str] = Counter()
         self.drops: Counter[str] = Counter()
         self._custom_data = {VERSION_KEY: __version__, **(custom_data or {})}
+        self._custom_data_pending = False
         self._distro = os.environ.get("ROS_DISTRO", "jazzy")
         self._split_bytes = split_bytes
         self._split_ns = split_ns
@@ -177,6 +178,12 @@ class BagWriter:
             self._wake.set()
         return True
 
+    def add_custom_data(self, values: Mapping[str, str]) -> None:
+        """Store more beside the messages, in this file, in later ones and in ``metadata.yaml``."""
+        with self._lock:
+            self._custom_data = {**self._custom_data, **values}
+            self._custom_data_pending = True
+
     def close(self) -> None:
         """Write what is queued and finish the bag; may be called again.
 
@@ -200,9 +207,13 @@ class BagWriter:
                 stopping = self._stopping
                 batch, self._queue = self._queue, deque()
                 self._queued = 0
+                custom_data = self._custom_data if self._custom_data_pending else None
+                self._custom_data_pending = False
             try:
                 if self._sync_error is not None:
                     raise self._sync_error
+                if custom_data is not None:
+                    self._file.add_metadata(CUSTOM_RECORD, custom_data)
                 while batch:
                     self._add(*batch[0])
                     batch.popleft()
