@@ -1,4 +1,4 @@
-"""The only place that knows topic names, message types, QoS, frames and signs on the wire.
+"""The only place that knows message types, QoS, frames and signs on the wire.
 
 Frames are right-handed with z up (REP-103). ``line``: x along the running direction from the left
 end of the modelled line, z = 0 at the rail head. A waveform's frame is its sensor group, an
@@ -24,6 +24,7 @@ from std_msgs.msg import Bool, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from solver import InputError, Scenario
+from trackvib_ros import topics
 from trackvib_ros.detection import Channel, Estimate, TrainEvent
 from trackvib_ros.pointcloud import decode, encode
 from trackvib_ros.station import TrainState, WheelsetState
@@ -60,34 +61,34 @@ class Topic:
     qos: QoSProfile
 
 
-CLOCK = Topic("/clock", Clock, CLOCK_QOS)
-DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, STATUS)
-SCENARIO = Topic("scenario", String, LATCHED)
-CHANNELS = Topic("channels", DiagnosticArray, LATCHED)
-MARKERS = Topic("markers", MarkerArray, STATUS)
-TRUE_ACCELERATION = Topic("ground_truth/acceleration", PointCloud2, STREAM)
-TRUE_WHEEL_FORCE = Topic("ground_truth/wheel_force", PointCloud2, STREAM)
-TRUE_WHEELSETS = Topic("ground_truth/wheelsets", PointCloud2, STREAM)
-TRUE_TRAIN = Topic("ground_truth/train", Odometry, STREAM)
-TRUE_PASSAGES = Topic("ground_truth/passages", DiagnosticArray, EVENTS)
-TRAIN_EVENTS = Topic("train/events", DiagnosticArray, EVENTS)
-TRAIN_OCCUPIED = Topic("train/occupied", Bool, LATCHED)
-TRAIN_SPEED = Topic("train/speed", TwistWithCovarianceStamped, EVENTS)
+CLOCK = Topic(topics.CLOCK, Clock, CLOCK_QOS)
+DIAGNOSTICS = Topic(topics.DIAGNOSTICS, DiagnosticArray, STATUS)
+SCENARIO = Topic(topics.SCENARIO, String, LATCHED)
+CHANNELS = Topic(topics.CHANNELS, DiagnosticArray, LATCHED)
+MARKERS = Topic(topics.MARKERS, MarkerArray, STATUS)
+TRUE_ACCELERATION = Topic(topics.TRUE_ACCELERATION, PointCloud2, STREAM)
+TRUE_WHEEL_FORCE = Topic(topics.TRUE_WHEEL_FORCE, PointCloud2, STREAM)
+TRUE_WHEELSETS = Topic(topics.TRUE_WHEELSETS, PointCloud2, STREAM)
+TRUE_TRAIN = Topic(topics.TRUE_TRAIN, Odometry, STREAM)
+TRUE_PASSAGES = Topic(topics.TRUE_PASSAGES, DiagnosticArray, EVENTS)
+TRAIN_EVENTS = Topic(topics.TRAIN_EVENTS, DiagnosticArray, EVENTS)
+TRAIN_OCCUPIED = Topic(topics.TRAIN_OCCUPIED, Bool, LATCHED)
+TRAIN_SPEED = Topic(topics.TRAIN_SPEED, TwistWithCovarianceStamped, EVENTS)
 
 
 def waveform_topic(group: str) -> Topic:
     """Full-rate blocks of a sensor group."""
-    return Topic(f"{group}/waveform", PointCloud2, STREAM)
+    return Topic(topics.waveform(group), PointCloud2, STREAM)
 
 
 def acceleration_topic(channel: str) -> Topic:
     """The peak of every block of a channel, for people and plots."""
-    return Topic(f"{channel}/acceleration", AccelStamped, STREAM)
+    return Topic(topics.acceleration(channel), AccelStamped, STREAM)
 
 
 def wheel_force_topic(number: int) -> Topic:
     """The force on the ``number``-th wheelset (from 1) of the train on the line."""
-    return Topic(f"wheel_force/wheelset_{number}", WrenchStamped, STREAM)
+    return Topic(topics.wheel_force(number), WrenchStamped, STREAM)
 
 
 def to_stamp(nanoseconds: int) -> Time:
@@ -311,7 +312,7 @@ def channels_by_topic(
     names: Sequence[str],
     positions: Sequence[float] | None,
     layers: Sequence[str] | None,
-    topics: Sequence[str] | None,
+    topic_names: Sequence[str] | None,
 ) -> dict[str, list[Channel]]:
     """The accelerometers stated by four lists of the same length, by topic.
 
@@ -322,7 +323,7 @@ def channels_by_topic(
         "channel_names": names,
         "channel_positions": positions or (),
         "channel_layers": layers or (),
-        "channel_topics": topics or (),
+        "channel_topics": topic_names or (),
     }
     if len({len(entries) for entries in lists.values()}) > 1:
         lengths = ", ".join(f"{name}: {len(entries)}" for name, entries in lists.items())
