@@ -119,6 +119,42 @@ class Element:
         bubbles = self.deflection(x)[:, 4:] / (2 * np.pi * self.internal_frequencies)
         return clamped_compliance(x, self.length, section) - np.asarray((bubbles**2).sum(axis=1))
 
+    def missing_deflection(self, x: Array, load: float, section: BeamSection) -> Array:
+        """Deflection at ``x`` per force at ``load`` that the functions miss (m/N): (len(x),)."""
+        scale = 2 * np.pi * self.internal_frequencies
+        bubbles = self.deflection(x)[:, 4:] / scale
+        there = self.deflection(np.array([load]))[0, 4:] / scale
+        return clamped_deflection(x, load, self.length, section) - np.asarray(bubbles @ there)
+
+
+def clamped_deflection(x: Array, load: float, length: float, section: BeamSection) -> Array:
+    """Deflection at ``x`` of a clamped-clamped beam per force at ``load`` (m/N): (len(x),).
+
+    Deflection and rotation under the load spread through the static shape functions of the
+    Timoshenko elements left and right of it (Przemieniecki 1968).
+    """
+    shear = 0.0 if section.shear_stiffness is None else 1 / section.shear_stiffness
+    load = min(max(load, 1e-9 * length), (1 - 1e-9) * length)
+    deflection = float(clamped_compliance(np.array([load]), length, section)[0])
+    k12, k22 = 0.0, 0.0
+    for part, sign in ((load, -1.0), (length - load, 1.0)):
+        p = 12 * section.bending_stiffness * shear / part**2
+        k = section.bending_stiffness / (part**3 * (1 + p))
+        k12 += sign * 6 * part * k
+        k22 += (4 + p) * part**2 * k
+    rotation = -k12 / k22 * deflection
+    value = np.empty(len(x))
+    for left in (True, False):
+        part, sign = (load, 1.0) if left else (length - load, -1.0)
+        side = x <= load if left else x > load
+        s = (x[side] if left else length - x[side]) / part
+        p = 12 * section.bending_stiffness * shear / part**2
+        value[side] = (
+            deflection * (3 * s**2 - 2 * s**3 + p * s)
+            + sign * rotation * part * (s**3 - s**2 + p / 2 * (s**2 - s))
+        ) / (1 + p)
+    return value
+
 
 def clamped_compliance(x: Array, length: float, section: BeamSection) -> Array:
     """Deflection per load at ``x`` of a clamped-clamped beam (m/N): (len(x),).

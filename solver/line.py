@@ -28,10 +28,10 @@ LAYERS: tuple[Layer, ...] = ("rail", "slab", "support_layer", "bridge")
 # Element sizes, resolution and the frequency up to which a layer follows the rail's limit are
 # chosen by measurement: tests/solver/test_line.py states the errors they leave.
 SLAB_ELEMENT = 4.0
-BAY_MARGIN = 1.6
-SINE_MARGIN = 1.25
+BAY_MARGIN = 2.9
+SINE_MARGIN = 1.5
 SINE_EXTRA = 4
-BRIDGE_LIMIT = 2000.0
+LAYER_LIMIT: Mapping[Layer, float] = {"support_layer": 2000.0, "bridge": 700.0}
 
 
 def beam_sections(track: Track) -> dict[Layer, BeamSection]:
@@ -186,6 +186,19 @@ class Structure:
             value[chosen] = element.missing_compliance(at, section)
         return value
 
+    def missing_rail_deflection(self, x: Array, load: float) -> Array:
+        """Static deflection of the rail at ``x`` per force at ``load`` that no coordinate carries.
+
+        (len(x),) m/N; zero outside the element of the load.
+        """
+        field, section = self.fields["rail"], beam_sections(self.scenario.track)["rail"]
+        number = int(np.clip(np.searchsorted(field.left, load, side="right") - 1, 0, None))
+        element, left = field.elements[number], float(field.left[number])
+        value = np.zeros(len(x))
+        inside = (x >= left) & (x <= left + element.length)
+        value[inside] = element.missing_deflection(x[inside] - left, load - left, section)
+        return value
+
     def probe(self, channel: Channel) -> Probe:
         """Rows of a channel: motion, strain, fastening force (whole row), bearing force.
 
@@ -299,7 +312,7 @@ def assemble(scenario: Scenario) -> Structure:
         {layer: int(np.isin(dofs[layer], free).sum()) for layer in fields},
         fastenings,
         {
-            layer: _valid_band(scenario, meshes[layer], orders[layer], sections[layer])
+            layer: _valid_band(scenario, layer, meshes[layer], orders[layer], sections[layer])
             for layer in fields
         },
         supports,
@@ -373,10 +386,7 @@ def _orders(
     solution = scenario.solution
     if solution.sines is not None:
         return [[solution.sines[LAYERS.index(layer)]] * (len(nodes) - 1) for nodes in meshes]
-    limit = solution.frequency_limit
-    if layer == "bridge":
-        limit = min(limit, BRIDGE_LIMIT)
-    wavenumber = section.wavenumber(limit)
+    wavenumber = section.wavenumber(_layer_limit(scenario, layer))
     if section.shear_stiffness is not None:
         return [
             [math.ceil(BAY_MARGIN * wavenumber * h / np.pi) for h in np.diff(nodes)]
@@ -388,11 +398,20 @@ def _orders(
     ]
 
 
+def _layer_limit(scenario: Scenario, layer: Layer) -> float:
+    """Frequency (Hz) up to which a layer is resolved."""
+    return min(scenario.solution.frequency_limit, LAYER_LIMIT.get(layer, math.inf))
+
+
 def _valid_band(
-    scenario: Scenario, meshes: list[Array], orders: list[list[int]], section: BeamSection
+    scenario: Scenario,
+    layer: Layer,
+    meshes: list[Array],
+    orders: list[list[int]],
+    section: BeamSection,
 ) -> float:
     """Frequency whose bending half-wave equals the shortest sine of the coarsest element."""
-    limit = scenario.solution.frequency_limit
+    limit = _layer_limit(scenario, layer)
     for nodes, order in zip(meshes, orders, strict=True):
         for h, n in zip(np.diff(nodes), order, strict=True):
             limit = min(limit, section.frequency(max(n, 1) * np.pi / h))

@@ -147,8 +147,7 @@ def modal_tables(
         compliance[row] = np.stack(
             [v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1
         )
-    compliance[0, :, 0] += line.residual[:-1]
-    compliance[0, :, 1] += np.diff(line.residual)
+    compliance[0] += line.residual
 
     channel = line.channel_shapes * root
     weights, feeds = [], []
@@ -331,8 +330,8 @@ def march(
     return int(lost), float(residual)
 
 
-@njit(cache=True, fastmath=FASTMATH, error_model="numpy")  # type: ignore[untyped-decorator]
-def _rail_row(cells, s, shape, modal, size):
+@njit(cache=True, fastmath=FASTMATH, error_model="numpy")
+def _rail_row(cells, s, shape, modal, size):  # type: ignore[no-untyped-def]
     total = 0.0
     for k in range(size):
         re = cells[k] + s * (
@@ -347,8 +346,8 @@ def _rail_row(cells, s, shape, modal, size):
     return total
 
 
-@njit(cache=True, fastmath=FASTMATH, error_model="numpy")  # type: ignore[untyped-decorator]
-def _march(
+@njit(cache=True, fastmath=FASTMATH, error_model="numpy")
+def _march(  # type: ignore[no-untyped-def]
     shapes,
     decay,
     drive,
@@ -661,9 +660,8 @@ class ModalRun:
         shapes = self.line.rail(place)
         weights = self.line.weights
         compliance = (shapes * (-weights / self.line.eigenvalues) @ shapes.T).real
-        edges = self.line.grid_start + self.line.grid_step * np.arange(len(self.line.residual))
         on_line = (place >= 0) & (place <= self.line.length)
-        compliance += np.diag(np.where(on_line, np.interp(place, edges, self.line.residual), 0.0))
+        compliance += np.diag(self.line.rail_residual(place))
         whole = block_units([unit.unit for unit in units])
         law = np.concatenate([unit.law for unit in units], axis=1)
         rest, force = static_start(whole, law, compliance, roughness)
