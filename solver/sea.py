@@ -74,7 +74,7 @@ class PowerBalance:
     def matrix(self) -> Real:
         """A of dE/dt = P - A E (1/s), shape (N, N)."""
         total = self.loss + self.coupling.sum(axis=1)
-        return self.omega * (np.diag(total) - self.coupling.T)
+        return np.asarray(self.omega * (np.diag(total) - self.coupling.T))
 
     def steady(self, power: ArrayLike) -> Real:
         """Energies E (J) under constant powers (W), shapes (N,) or (N, k).
@@ -88,7 +88,7 @@ class PowerBalance:
             raise SolverError(
                 "power balance: largest loss factor = 0; a steady state needs > 0"
             ) from None
-        return checked_energy(energy)
+        return checked_energy(np.asarray(energy))
 
     def propagator(self, step: float) -> tuple[Real, Real]:
         """(N, N) matrices of E(t + step) = decay E(t) + gain P for power constant in the step.
@@ -177,9 +177,7 @@ def bed_conductance(omega: float, beam_a: WaveBeam, beam_b: WaveBeam, stiffness:
         beam_a, beam_b: the beams, both held by the bed (losses included).
         stiffness: k' + i omega c' of the bed (N/m^2).
     """
-    shortest = 2 * math.pi / max(
-        float(beam_a.wavenumber(omega)), float(beam_b.wavenumber(omega))
-    )
+    shortest = 2 * math.pi / max(float(beam_a.wavenumber(omega)), float(beam_b.wavenumber(omega)))
     x = np.arange(0, _reach(omega, beam_a, beam_b), shortest / 40)
     y_a = (1j * omega * beam_a.transfer_receptance(omega, x)).real
     y_b = (1j * omega * beam_b.transfer_receptance(omega, x)).real

@@ -47,11 +47,7 @@ class WaveBeam:
     def inertia_term(self, omega: ArrayLike) -> Complex:
         """Z = m omega^2 - k' - i omega c' (N/m^2), shape of ``omega`` (rad/s)."""
         w = np.asarray(omega, dtype=np.float64)
-        return (
-            self.mass_per_length * w**2
-            - self.support_stiffness
-            - 1j * w * self.support_damping
-        )
+        return self.mass_per_length * w**2 - self.support_stiffness - 1j * w * self.support_damping
 
     def exponents(self, omega: ArrayLike) -> Complex:
         """Decaying exponents s (1/m): the field is a sum of exp(-s |x|).
@@ -88,9 +84,7 @@ class WaveBeam:
             self.support_stiffness,
         )
         h = 1e-4
-        return np.asarray(
-            2 * h * w / (bare.wavenumber(w * (1 + h)) - bare.wavenumber(w * (1 - h)))
-        )
+        return np.asarray(2 * h * w / (bare.wavenumber(w * (1 + h)) - bare.wavenumber(w * (1 - h))))
 
     def modal_density(self, omega: ArrayLike, length: float) -> Real:
         """n = L / (pi c_g), modes per rad/s (Lyon and DeJong 1995, one-dimensional systems)."""
@@ -230,10 +224,10 @@ class PeriodicRail:
     def support_stiffness(self, omega: ArrayLike) -> Complex:
         """Dynamic stiffness of a support, foundation in series (N/m)."""
         w = np.asarray(omega, dtype=np.float64)
-        pad = self.stiffness + 1j * w * self.damping
+        pad = np.asarray(self.stiffness + 1j * w * self.damping, dtype=np.complex128)
         if self.foundation is None:
             return pad
-        return pad / (1 + pad * self.foundation.transfer_receptance(w, 0.0))
+        return np.asarray(pad / (1 + pad * self.foundation.transfer_receptance(w, 0.0)))
 
     def _supports(self) -> list[tuple[float, float]]:
         middle = self.spacing / 2
@@ -288,7 +282,7 @@ class PeriodicRail:
         order = order[:, [2, 3, 1, 0]]
         values = np.take_along_axis(values, order, axis=-1)
         vectors = np.take_along_axis(vectors, order[:, None, :], axis=-1)
-        return values, vectors * scale[:, :, None]
+        return np.asarray(values), np.asarray(vectors * scale[:, :, None])
 
     def _scale(self, omega: Real) -> Real:
         q = np.abs(self.beam.exponents(omega)[:, 0])
@@ -303,8 +297,8 @@ class PeriodicRail:
         to_load = self._to(omega, load)
         scaled = (to_load @ states) / scale[:, :, None]
         scaled[:, :, 2:] *= -1
-        amplitudes = np.linalg.solve(scaled, jump / scale[:, :, None])[:, :, 0]
-        return values, states, amplitudes
+        solved = np.linalg.solve(scaled, jump / scale[:, :, None])
+        return values, states, np.asarray(solved[:, :, 0])
 
     def receptance(self, omega: ArrayLike, load: float, place: float) -> Complex:
         """Displacement at ``place`` per point force at ``load`` (m/N), shape (F,).
@@ -359,9 +353,7 @@ class PeriodicRail:
         samples = [square(place)[0] for place in self.load_positions(24)]
         mean = np.mean(samples, axis=0)
         velocity = 1j * w[:, None] * wave[:, :2]
-        power = -np.real(
-            wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj()
-        )
+        power = -np.real(wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj())
         # The rail itself loses nothing: the power falls in one step at the support in mid-bay.
         # With the smooth decay removed its mean over the bay is the factor sinh(h)/h.
         h = decay * self.spacing / 2

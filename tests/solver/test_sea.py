@@ -64,7 +64,7 @@ def test_reciprocity_is_demanded() -> None:
     coupling = np.array([[0.0, 0.01], [0.01, 0.0]])
     with pytest.raises(SolverError, match="reciprocity"):
         PowerBalance(OMEGA, np.array([0.01, 0.01]), coupling, np.array([3e-4, 8e-4]))
-    with pytest.raises(SolverError, match="eta_r = -0.01"):
+    with pytest.raises(SolverError, match=r"eta_r = -0\.01"):
         PowerBalance(OMEGA, np.array([-0.01]), np.zeros((1, 1)), np.array([3e-4]))
 
 
