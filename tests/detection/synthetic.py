@@ -163,3 +163,71 @@ def blocks(
         for first in range(0, len(data), size):
             out.append(Waveform(stamp_ns + first * dt, dt, tuple(names), data[first : first + size]))
     return sorted(out, key=lambda block: block.end_ns)
+
+
+NUISANCES = ("hammer", "road", "footsteps", "trolley", "rain", "spikes", "hum", "neighbour")
+
+
+def nuisance(kind: str, duration: float, rate: float, rng: np.random.Generator) -> Array:
+    """A disturbance of about unit level that is no train on this track."""
+    time = np.arange(int(duration * rate)) / rate
+    out = np.zeros(time.size)
+
+    def hit(at: float, amplitude: float, frequency: float, decay: float) -> None:
+        first = int(at * rate)
+        t = time[first : first + int(8 * decay * rate)] - at
+        ring = np.exp(-t / decay) * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 6))
+        out[first : first + t.size] += amplitude * ring
+
+    if kind == "hammer":
+        at = rng.uniform(1, 3)
+        interval = rng.uniform(0.3, 1.5)
+        for _ in range(rng.integers(3, 25)):
+            if at > duration - 1:
+                break
+            hit(at, rng.uniform(1, 4), rng.uniform(100, 700), rng.uniform(0.005, 0.03))
+            at += interval * rng.normal(1, 0.08)
+    elif kind == "road":
+        for _ in range(rng.integers(1, 4)):
+            centre, width = rng.uniform(2, duration - 2), rng.uniform(0.4, 1.5)
+            envelope = np.exp(-0.5 * ((time - centre) / width) ** 2)
+            out += envelope * _band_noise(rng, time.size, rate, 8, rng.uniform(25, 120))
+    elif kind == "footsteps":
+        at, pace = 1.0, rng.uniform(0.45, 0.7)
+        while at < duration - 1:
+            hit(at, rng.uniform(0.5, 1.5), rng.uniform(20, 90), 0.03)
+            at += pace * rng.normal(1, 0.03)
+    elif kind == "trolley":
+        speed = rng.uniform(1.0, 4.0)
+        centre = duration / 2
+        envelope = 1 / (1 + ((time - centre) * speed / 4) ** 2)
+        out += envelope * _band_noise(rng, time.size, rate, 40, 500)
+        for joint in np.arange(-30, 30, 3.0):
+            for axle in (0.0, 1.8):
+                at = centre + (joint + axle) / speed
+                if 0.5 < at < duration - 1:
+                    level = 3 / (1 + (joint / 4) ** 2)
+                    hit(at, level, 300, 0.01)
+    elif kind == "rain":
+        for at in np.cumsum(rng.exponential(0.12, int(duration / 0.12))):
+            if at < duration - 1:
+                hit(at, rng.lognormal(-1, 0.8), rng.uniform(200, 900), 0.004)
+    elif kind == "spikes":
+        for at in rng.uniform(0.5, duration - 0.5, rng.integers(3, 30)):
+            first = int(at * rate)
+            out[first : first + rng.integers(1, 20)] += rng.choice([-1, 1]) * rng.uniform(2, 20)
+    elif kind == "hum":
+        on, off = sorted(rng.uniform(1, duration - 1, 2))
+        out += np.where((time > on) & (time < off), np.sin(2 * np.pi * 50 * time), 0.0)
+    elif kind == "neighbour":
+        # a train on the next track: its wheelsets smeared over 8 m of ground, low frequencies
+        train = CATALOGUE["CRH3"].axles
+        speed = rng.uniform(30, 100)
+        envelope = np.zeros(time.size)
+        for axle in train:
+            s = (time - 2) * speed - axle
+            envelope += np.exp(-0.5 * (s / 8.0) ** 2)
+        out += envelope / envelope.max() * _band_noise(rng, time.size, rate, 8, 80)
+    else:
+        raise ValueError(kind)
+    return out

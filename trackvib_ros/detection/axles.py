@@ -88,6 +88,13 @@ def _pulse(energy: Array, shift: Array, floor: float, classes: NDArray[np.int64]
             shape = np.mean(scaled, axis=0)
         smooth = np.convolve(np.pad(shape, 2, "edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         out[c] = smooth / smooth.mean()
+    # a mirror image of the leading wheelset's pulse is the trailing one's: without this symmetry
+    # the pulse would take up a common error of all places, and two channels no distance
+    before, behind = out[1].copy(), out[2].copy()
+    out[0], out[3] = 0.5 * (out[0] + out[0, ::-1]), 0.5 * (out[3] + out[3, ::-1])
+    if (classes == 1).any() and (classes == 2).any():
+        out[1] = 0.5 * (before + behind[::-1])
+        out[2] = out[1, ::-1]
     return out
 
 

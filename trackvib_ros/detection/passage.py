@@ -359,27 +359,42 @@ def find_passages(
     limits: tuple[float, float],
     truncated: bool = False,
 ) -> list[Passage]:
-    """Every train in an event, in order of time: where there is a pause, one or two are tried."""
+    """Every train in an event, in order of time: at the longest pauses, two are tried for one."""
     rails = [r for r in records if r.channel.layer == "rail" and _excited(r, within)]
     if not rails:
         return []
     whole = find_passage(rails, within, catalogue.types, limits, truncated)
     if whole is None:
         return []
+    return _divided(rails, within, whole, catalogue, limits, truncated, depth=3)
+
+
+def _divided(
+    rails: Sequence[Record],
+    within: tuple[float, float],
+    whole: Passage,
+    catalogue: Catalogue,
+    limits: tuple[float, float],
+    truncated: bool,
+    depth: int,
+) -> list[Passage]:
     trace = whole.traces[0]
-    bandwidth = whole.band[1] - whole.band[0]
-    gaps = quiet_gaps(trace, bandwidth, within, 0.6)
-    if whole.score > 0.8 or not gaps:
+    gaps = quiet_gaps(trace, whole.band[1] - whole.band[0], within, 0.6)
+    if whole.score > 0.8 or depth == 0:
         return [whole]
-    best, parts = whole.score + 0.05, [whole]
-    for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:4]:
+    for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
-        left = find_passages(rails, (within[0], middle), catalogue, limits, truncated)
-        right = find_passages(rails, (middle, within[1]), catalogue, limits)
-        if not left or not right:
-            continue
-        scores = [part.score for part in (*left, *right)]
-        mean = sum(scores) / len(scores)
-        if min(scores) >= CONFIRM_SCORE and mean > best:
-            best, parts = mean, [*left, *right]
-    return parts
+        halves = ((within[0], middle), (middle, within[1]))
+        parts = []
+        for half, cut in zip(halves, (truncated, False), strict=True):
+            part = find_passage(rails, half, catalogue.types, limits, cut)
+            if part is None or part.score < CONFIRM_SCORE:
+                break
+            parts.append(part)
+        if len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1:
+            return [
+                found
+                for half, part, cut in zip(halves, parts, (truncated, False), strict=True)
+                for found in _divided(rails, half, part, catalogue, limits, cut, depth - 1)
+            ]
+    return [whole]
