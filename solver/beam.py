@@ -117,14 +117,14 @@ class Element:
         under the load; left out, it makes a spurious ripple of the element's period.
         """
         bubbles = self.deflection(x)[:, 4:] / (2 * np.pi * self.internal_frequencies)
-        return clamped_compliance(x, self.length, section) - np.asarray((bubbles**2).sum(axis=1))
+        return np.asarray(clamped_compliance(x, self.length, section) - (bubbles**2).sum(axis=1))
 
     def missing_deflection(self, x: Array, load: float, section: BeamSection) -> Array:
         """Deflection at ``x`` per force at ``load`` that the functions miss (m/N): (len(x),)."""
         scale = 2 * np.pi * self.internal_frequencies
         bubbles = self.deflection(x)[:, 4:] / scale
         there = self.deflection(np.array([load]))[0, 4:] / scale
-        return clamped_deflection(x, load, self.length, section) - np.asarray(bubbles @ there)
+        return np.asarray(clamped_deflection(x, load, self.length, section) - bubbles @ there)
 
 
 def clamped_deflection(x: Array, load: float, length: float, section: BeamSection) -> Array:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -74,7 +75,7 @@ class Field:
     @property
     def right(self) -> Array:
         """(E,) right ends of the elements (m)."""
-        return self.left + np.array([element.length for element in self.elements])
+        return np.asarray(self.left + np.array([element.length for element in self.elements]))
 
     def rows(self, x: Array, derivative: int = 0) -> sp.csr_array:
         """Rows of the deflection's derivative at ``x`` (m): (len(x), N).
@@ -251,7 +252,7 @@ def assemble(scenario: Scenario) -> Structure:
     Raises:
         SolverError: the stiffness is singular (a part of the track is not held).
     """
-    track, line = scenario.track, scenario.line
+    track = scenario.track
     sections = beam_sections(track)
     fastenings = _fastening_positions(scenario)
     meshes = {layer: _nodes(scenario, layer, fastenings) for layer in LAYERS}
@@ -262,7 +263,7 @@ def assemble(scenario: Scenario) -> Structure:
         name: sp.csr_array((size, size)) for name in ("mass", "damping", "stiffness")
     }
     for layer, field in fields.items():
-        mass, stiffness = _beam_matrices(field, sections[layer])
+        mass, stiffness = beam_matrices(field, sections[layer])
         full["mass"] += mass
         full["stiffness"] += stiffness
         if layer == "bridge":
@@ -327,7 +328,7 @@ def _fastening_positions(scenario: Scenario) -> Array:
     fastening = scenario.track.fastening
     first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
     count = math.floor((scenario.line.length - first) / fastening.spacing + 1e-9) + 1
-    return first + fastening.spacing * np.arange(max(count, 0))
+    return np.asarray(first + fastening.spacing * np.arange(max(count, 0)), np.float64)
 
 
 def _factor(track: Track, parameter: str, x: Array) -> Array:
@@ -343,7 +344,7 @@ def _factor(track: Track, parameter: str, x: Array) -> Array:
 def _spread(bounds: list[float], longest: float) -> list[float]:
     """Nodes from first to last bound, none further apart than ``longest``."""
     nodes = [bounds[0]]
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         if b - a > 1e-9:
             nodes += list(np.linspace(a, b, math.ceil((b - a) / longest - 1e-9) + 1)[1:])
     return nodes
@@ -414,8 +415,26 @@ def _valid_band(
     limit = _layer_limit(scenario, layer)
     for nodes, order in zip(meshes, orders, strict=True):
         for h, n in zip(np.diff(nodes), order, strict=True):
-            limit = min(limit, section.frequency(max(n, 1) * np.pi / h))
+            limit = min(limit, section.frequency(max(n, 1) * math.pi / float(h)))
     return limit
+
+
+def beam_field(nodes: Array, orders: list[int], section: BeamSection, start: int = 0) -> Field:
+    """Continuous beam over ``nodes`` (m) with ``orders`` hierarchical functions per element.
+
+    Coordinates are numbered from ``start`` element by element, so that matrices are banded.
+    """
+    elements: list[Element] = []
+    tables: list[np.ndarray] = []
+    end = start
+    size = start + 2
+    for h, n in zip(np.diff(nodes), orders, strict=True):
+        # rounding makes equal lengths share one element
+        elements.append(beam_element(round(float(h), 9), section, n))
+        begin, end = end, size + n
+        tables.append(np.r_[begin, begin + 1, end, end + 1, np.arange(size, size + n)])
+        size = end + 2
+    return Field(np.array(nodes[:-1], float), tuple(elements), tuple(tables), size)
 
 
 def _number(
@@ -434,23 +453,17 @@ def _number(
         tables: list[np.ndarray] = []
         start = size
         for nodes, order in zip(meshes[layer], orders[layer], strict=True):
-            first = size
-            for number, n in enumerate(order):
-                # rounding makes equal lengths share one element
-                h = round(float(nodes[number + 1] - nodes[number]), 9)
-                element = beam_element(h, sections[layer], n)
-                own = size + 2 if number == 0 else size
-                begin = first if number == 0 else end
-                end = own + n
-                tables.append(np.r_[begin, begin + 1, end, end + 1, np.arange(own, own + n)])
-                size = end + 2
-                left.append(float(nodes[number]))
-                elements.append(element)
+            chain = beam_field(nodes, order, sections[layer], size)
+            first, last = int(chain.dofs[0][0]), int(chain.dofs[-1][2])
             if layer == "bridge":
                 if scenario.track.bridge.bearing_stiffness is None:
-                    held += [first, end]
+                    held += [first, last]
             elif scenario.line.ends == "pinned":
-                held += [first, end]
+                held += [first, last]
+            left += list(chain.left)
+            elements += chain.elements
+            tables += chain.dofs
+            size = chain.size
         if elements:
             parts[layer] = (left, elements, tables)
             dofs[layer] = np.arange(start, size)
@@ -481,7 +494,8 @@ def _finest(field: Field) -> float:
     return max(2 * np.pi * (e.functions - 2) / e.length for e in field.elements)
 
 
-def _beam_matrices(field: Field, section: BeamSection) -> tuple[sp.csr_array, sp.csr_array]:
+def beam_matrices(field: Field, section: BeamSection) -> tuple[sp.csr_array, sp.csr_array]:
+    """Mass and stiffness of a free beam by Gauss quadrature: two (N, N) matrices."""
     breaks = np.concatenate([field.left, field.right])
     x, weight = _gauss(breaks, _finest(field))
     weight = weight * (abs(field.rows(x)).sum(axis=1) > 0)
