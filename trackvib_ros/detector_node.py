@@ -37,11 +37,10 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
     def __init__(self, stop: Stop, **arguments: Any) -> None:
         super().__init__("detector", **arguments)
         self.failure: str | None = None
-        self.done = False
         self._intake: Intake | None = None
         self._channels: dict[str, list[m.Channel]] = {}
         self._description: Any = None
-        self._inputs: list[Any] = []
+        self._inputs: list[tuple[str, Any]] = []
         self._recorder: Recorder | None = None
         self._outbox = Outbox(self)
         declare(self, SETTINGS)
@@ -109,6 +108,11 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         """Finish everything."""
         return self.on_cleanup(state)
 
+    @property
+    def done(self) -> bool:
+        """True when the process shall end: it could not start."""
+        return self.failure is not None and value(self, "autostart") and self._recorder is None
+
     def work(self) -> float:
         """Nothing but callbacks; returns how long to wait for them (s)."""
         self._outbox.flush()
@@ -126,12 +130,20 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             self._listen(channels)
 
     def _be_quiet(self) -> None:
-        for subscription in self._inputs:
+        for topic, subscription in self._inputs:
+            self._drain(topic, subscription)
             self.destroy_subscription(subscription)
         self._inputs.clear()
         if self._intake is not None:
             self._publish(self._intake.finish())
         self._intake = None
+
+    def _drain(self, topic: str, subscription: Any) -> None:
+        """Take what has arrived but was not called for yet."""
+        with subscription.handle:
+            while taken := subscription.handle.take_message(subscription.msg_type, False):
+                if self._intake is not None:
+                    self._publish(self._intake.take(topic, taken[0]))
 
     def _listen(self, channels: dict[str, list[m.Channel]]) -> None:
         self._intake = Intake(channels)
@@ -142,7 +154,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
                 if self._intake is not None:
                     self._publish(self._intake.take(topic, message))
 
-            self._inputs.append(self.create_subscription(m.PointCloud2, topic, take, qos))
+            self._inputs.append((topic, self.create_subscription(m.PointCloud2, topic, take, qos)))
 
     def _publish(self, events: list[TrainEvent]) -> None:
         for event in events:
@@ -172,7 +184,8 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         drops = sum(recorder.drops.values())
         warning = recorder.failure or (f"{drops} messages lost" if drops else None)
         counts = {f"recorded {topic}": n for topic, n in recorder.counts.items()}
-        return warning, {"bag": recorder.directory, "lost": drops, **counts}
+        failure = recorder.failure or ""
+        return warning, {"bag": recorder.directory, "lost": drops, "failure": failure, **counts}
 
 
 if __name__ == "__main__":

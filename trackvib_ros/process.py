@@ -166,6 +166,7 @@ def transition(callback: Transition) -> Transition:
         except Exception as error:
             node.failure = f"{callback.__name__}: {error!r}"
             node.get_logger().error(traceback.format_exc())
+            node.get_logger().error(node.failure)
             return TransitionCallbackReturn.ERROR
 
     return told

@@ -207,6 +207,7 @@ class Run:
                 {
                     "state": self.state,
                     "time_s": time_ns * 1e-9,
+                    "end_s": self.station.end_s,
                     "real_time_factor": round(simulated_s / (now - wall), 3),
                     "wall_per_simulated": round(wall_s / simulated_s, 4) if simulated_s else 0.0,
                     "late_s": round(self.pace.late_s, 3),

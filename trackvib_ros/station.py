@@ -127,6 +127,13 @@ class Station:
         """True when the end of the run is reached; a further train ends that."""
         return self._headway == 0 and self._index >= self.simulation.end_index
 
+    @property
+    def end_s(self) -> float:
+        """Simulated time at which the run ends (s); infinite with random headways."""
+        if self._headway > 0:
+            return float("inf")
+        return self.simulation.end_index * self.simulation.step_ns * 1e-9
+
     def _draw_headway(self, after_ns: int) -> int:
         wait = self._least_headway + self._random.exponential(self._headway)
         return after_ns + round(wait * 1e9)

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from solver import InputError, SolverError
 from trackvib_ros import __version__
@@ -59,7 +60,7 @@ def main() -> None:
     try:
         app()
     except (InputError, SolverError) as failure:
-        error.print(f"[bold red]trackvib:[/bold red] {failure}", markup=True)
+        error.print(f"[bold red]trackvib:[/bold red] {escape(str(failure))}", markup=True)
         sys.exit(2)
     except OSError as failure:
         if failure.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
