@@ -181,11 +181,17 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         self._outbox.put(m.DIAGNOSTICS, m.diagnostics_message(stamp, self.get_name(), components))
 
     def _recorder_state(self, recorder: Recorder) -> tuple[str | None, dict[str, object]]:
-        drops = sum(recorder.drops.values())
-        warning = recorder.failure or (f"{drops} messages lost" if drops else None)
+        drops = {t: n for t, n in recorder.drops.items() if n and t != m.CLOCK.name}
+        lost = ", ".join(f"{n} of {topic}" for topic, n in drops.items())
+        warning = recorder.failure or (f"messages lost: {lost}" if drops else None)
         counts = {f"recorded {topic}": n for topic, n in recorder.counts.items()}
         failure = recorder.failure or ""
-        return warning, {"bag": recorder.directory, "lost": drops, "failure": failure, **counts}
+        return warning, {
+            "bag": recorder.directory,
+            "lost": sum(drops.values()),
+            "failure": failure,
+            **counts,
+        }
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter, deque
 from typing import Any
 
@@ -72,10 +73,12 @@ class Outbox:
 
     def acknowledged(self, timeout_s: float) -> bool:
         """Wait until every reliable reader has taken everything; False after ``timeout_s``."""
-        share = Duration(nanoseconds=int(timeout_s * 1e9))
-        return all(
-            publisher.wait_for_all_acked(share) for _, publisher in self._publishers.values()
-        )
+        deadline = time.monotonic() + timeout_s
+        for _, publisher in self._publishers.values():
+            left = max(0.0, deadline - time.monotonic())
+            if not publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9))):
+                return False
+        return True
 
     def close(self) -> None:
         """Destroy the publishers; what is queued is given up."""

@@ -16,6 +16,11 @@ from trackvib_ros.station import Station, StationStep
 WAIT_S = 0.02
 """Wall time between two looks at subscriptions or a full middleware (s)."""
 
+DELIVERY_S = 10.0
+"""Time that readers get to take what is left of a run that is over (s)."""
+HURRY_S = 0.5
+"""The same for a run that is cut short (s)."""
+
 Component = tuple[str, str | None, Mapping[str, object]]
 
 
@@ -240,9 +245,10 @@ class Run:
         """Simulated time reached (ns)."""
         return self.station.time_ns
 
-    def close(self, timeout_s: float) -> bool:
-        """Free the topics; False if a reader had not taken everything within ``timeout_s``."""
-        complete = self._outbox.flush() and self._outbox.acknowledged(timeout_s)
+    def close(self) -> bool:
+        """Free the topics; False if a reader has not taken everything in reasonable time."""
+        patience = DELIVERY_S if self.finished else HURRY_S
+        complete = self._outbox.flush() and self._outbox.acknowledged(patience)
         self._clock.close()
         self._outbox.close()
         return complete

@@ -97,7 +97,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
 
         station = in_background(assemble, self._stop)
         if self._run is not None:
-            self._run.close(1.0)
+            self._run.close()
         self._run = Run(self, station, value(self, "ground_truth"))
         self._run.detectors = value(self, "await_detectors")
         self._run.recorders = value(self, "await_recorders")
@@ -121,7 +121,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free model and topics."""
         self._active = False
-        if self._run is not None and not self._run.close(1.0):
+        if self._run is not None and not self._run.close():
             self.get_logger().warning("a subscriber has not taken everything")
         self._run = None
         return super().on_cleanup(state)

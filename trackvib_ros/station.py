@@ -104,13 +104,15 @@ class Station:
         self.sensors = SensorArray(scenario, [channel.name for channel in scenario.channel])
         self.simulation = Simulation(scenario, outputs=("acceleration",), report=report)
         self._samples = max(2, round(STEP_S * 1e9 / self.simulation.step_ns))
-        self._index = 0
+        self._index = self._computed = 0
         self._headway, self._least_headway = headway, least_headway
         self._random = np.random.default_rng([scenario.irregularity.seed, 0x7264])
         self._next_train_ns = self._draw_headway(0)
         self._known = 0
         self._coming: list[tuple[int, int, PassageTruth]] = []
         self._present: list[PassageTruth] = []
+        # the first step loads the compiled kernel, which takes seconds: better now than while running
+        self._first: StationStep | None = self._compute()
 
     @property
     def time_ns(self) -> int:
@@ -118,9 +120,8 @@ class Station:
         return self._index * self.simulation.step_ns
 
     @property
-    def step_ns(self) -> int:
-        """Simulated time of one step of the station (ns)."""
-        return self._samples * self.simulation.step_ns
+    def _computed_ns(self) -> int:
+        return self._computed * self.simulation.step_ns
 
     @property
     def finished(self) -> bool:
@@ -156,7 +157,7 @@ class Station:
         # so that the first wheelset needs half a second to the line, outside the static zone
         away = 0.5 * speed + 1.0
         start = -away if train.direction == "forward" else self.scenario.line.length + away
-        update |= {"speed": speed, "start": start, "start_time": self.time_ns * 1e-9}
+        update |= {"speed": speed, "start": start, "start_time": self._computed_ns * 1e-9}
         train = train.model_copy(update=update)
         return self.simulation.add_train(train, train.start_time) + 1
 
@@ -166,12 +167,18 @@ class Station:
         Raises:
             SolverError: the computation left its valid range.
         """
-        start_ns = self.time_ns
+        step = self._first or self._compute()
+        self._first = None
+        self._index = self._computed
+        return step
+
+    def _compute(self) -> StationStep:
+        start_ns = self._computed_ns
         if self._headway > 0 and start_ns >= self._next_train_ns:
             self.trigger()
             self._next_train_ns = self._draw_headway(start_ns)
         block = self.simulation.advance(self._samples)
-        self._index += self._samples
+        self._computed += self._samples
         acceleration = block.acceleration
         if acceleration is None:
             raise AssertionError("the simulation was asked for acceleration")
@@ -185,7 +192,7 @@ class Station:
         entered = self._admit()
         force, wheelsets = self._wheelsets(start_ns, block.wheelset_position, block.wheelset_force)
         return StationStep(
-            time_ns=self.time_ns,
+            time_ns=self._computed_ns,
             start_ns=start_ns,
             waveforms=self.sensors.push(acceleration),
             acceleration=truth,
@@ -227,11 +234,11 @@ class Station:
             heapq.heappush(self._coming, (passage.enter_ns, index, passage))
         self._known = len(motions)
         entered = []
-        while self._coming and self._coming[0][0] < self.time_ns:
+        while self._coming and self._coming[0][0] < self._computed_ns:
             passage = heapq.heappop(self._coming)[2]
             if passage.leave_ns > 0:
                 entered.append(passage)
-        self._present = [p for p in self._present + entered if p.leave_ns >= self.time_ns]
+        self._present = [p for p in self._present + entered if p.leave_ns >= self._computed_ns]
         return entered
 
     def _train(self, number: int, now_ns: int) -> TrainState:
