@@ -10,8 +10,11 @@ continuously in deflection and rotation whatever their ``n``.
   dependent (condition number of the mass matrix 1e13 for 32 sines on 72 m).
 * Timoshenko: deflection ``w`` and rotation ``theta`` of the section. The nodal functions are the
   exact static shapes (shear angle constant in the element, hence no locking); the hierarchical
-  ones are the ``n`` lowest modes of the clamped element (component modes; Hurty 1965, Craig and
-  Bampton 1968), computed once per length in integrated Legendre polynomials.
+  ones are the lowest modes of the clamped element (component modes; Hurty 1965, Craig and
+  Bampton 1968) and, last, four residual vectors: the clamped element's static answer to the
+  inertia of the nodal shapes, as far as those modes miss it. On a bay of 0.65 m six modes and four
+  vectors follow the rail to 4.9 kHz within 6e-5 in frequency, ten modes alone within 2e-3.
+  All are computed once per length in integrated Legendre polynomials.
 """
 
 from __future__ import annotations
@@ -69,6 +72,9 @@ class BeamSection:
         w2 = 2 * s * a * k2 * k2 / (b + math.sqrt(b * b - 4 * m * r * s * a * k2 * k2))
         return math.sqrt(w2) / (2 * math.pi)
 
+
+RESIDUAL_FROM = 2
+"""Hierarchical functions that are modes before residual vectors are added."""
 
 Family = Literal["sines", "legendre"]
 
@@ -233,7 +239,7 @@ def _euler_bernoulli(length: float, section: BeamSection, n: int) -> Element:
 
 def _timoshenko(length: float, section: BeamSection, n: int) -> Element:
     assert section.shear_stiffness is not None
-    bubbles = 2 * n + 10
+    bubbles = 2 * n + 16
     size = bubbles + 2
     legendre = np.polynomial.legendre
     # bubble_j = (P_{j+2} - P_j) / sqrt(2 (2j + 3)) vanishes at both ends
@@ -243,26 +249,38 @@ def _timoshenko(length: float, section: BeamSection, n: int) -> Element:
     bubble[j, j] = -bubble[j + 2, j]
     points, weights = legendre.leggauss(size + 1)
     s, weights = (points + 1) / 2, weights / 2 * length
-    value = _primitives("legendre", size, s, 0) @ bubble
-    slope = _primitives("legendre", size, s, 1) @ bubble / length
-    zero = np.zeros_like(value)
-    shear = np.hstack([slope, -value])
-    bending = np.hstack([zero, slope])
-    w, theta = np.hstack([value, zero]), np.hstack([zero, value])
+    zero = np.zeros((size, bubbles))
+    static_deflection, static_rotation = _static_shapes(length, section, size)
+    deflection = np.hstack([static_deflection, bubble, zero])
+    rotation = np.hstack([static_rotation, zero, bubble])
+    value, slope = (_primitives("legendre", size, s, d) / length**d for d in (0, 1))
 
     def gram(rows: Array, factor: float) -> Array:
         return np.asarray(rows.T @ (factor * weights[:, None] * rows))
 
-    stiff = gram(shear, section.shear_stiffness) + gram(bending, section.bending_stiffness)
-    mass = gram(w, section.mass_per_length) + gram(theta, section.rotary_inertia)
-    deflection, rotation = np.zeros((size, 4 + n)), np.zeros((size, 4 + n))
-    deflection[:, :4], rotation[:, :4] = _static_shapes(length, section, size)
-    squared = np.zeros(0)
-    if n:
-        squared, vectors = scipy.linalg.eigh(stiff, mass, subset_by_index=[0, n - 1])
-        deflection[:, 4:] = bubble @ vectors[:bubbles]
-        rotation[:, 4:] = bubble @ vectors[bubbles:]
-    return Element(length, "legendre", deflection, rotation, np.sqrt(squared) / (2 * np.pi))
+    stiff = gram(slope @ deflection - value @ rotation, section.shear_stiffness)
+    stiff += gram(slope @ rotation, section.bending_stiffness)
+    mass = gram(value @ deflection, section.mass_per_length)
+    mass += gram(value @ rotation, section.rotary_inertia)
+    squared, modes = scipy.linalg.eigh(stiff[4:, 4:], mass[4:, 4:])
+    residual = min(4, max(n - RESIDUAL_FROM, 0))
+    kept = n - residual
+    chosen, square = modes[:, :kept], squared[:kept]
+    if residual:
+        inertia = modes[:, kept:].T @ mass[4:, :4] / np.sqrt(mass.diagonal()[:4])
+        basis, _ = np.linalg.qr(inertia / np.sqrt(squared[kept:, None]))
+        basis = basis[:, :residual] / np.sqrt(squared[kept:, None])
+        compliance, turn = np.linalg.eigh(basis.T @ basis)
+        compliance, turn = compliance[::-1], turn[:, ::-1]
+        chosen = np.hstack([chosen, modes[:, kept:] @ (basis @ turn / np.sqrt(compliance))])
+        square = np.concatenate([square, 1 / compliance])
+    return Element(
+        length,
+        "legendre",
+        np.hstack([static_deflection, bubble @ chosen[:bubbles]]),
+        np.hstack([static_rotation, bubble @ chosen[bubbles:]]),
+        np.sqrt(square) / (2 * np.pi),
+    )
 
 
 def _static_shapes(length: float, section: BeamSection, size: int) -> tuple[Array, Array]:
