@@ -28,6 +28,8 @@ RCLError = rclpy_implementation.RCLError
 
 SETTLE_S = 1.0
 """Subscriptions count as complete when none was added for this long (s)."""
+DISCOVERY_S = 4.0
+"""Without any subscription, playing begins after this time (s)."""
 MAX_LATCHED = 1000
 BEST_EFFORT_DEPTH = 100
 DIAGNOSTICS = "/diagnostics"
@@ -243,13 +245,16 @@ class Player:
                     f"{', '.join(p.topic_name for p in self._publishers.values())}"
                 )
             wanted += matching
-        steady_since, last = time.monotonic(), -1
+        began = steady_since = time.monotonic()
+        last = 0
         while running():
             count = sum(p.get_subscription_count() for p in self._publishers.values())
             if count != last:
                 steady_since, last = time.monotonic(), count
             ready = all(publisher.get_subscription_count() > 0 for publisher in wanted)
-            if ready and time.monotonic() - steady_since >= SETTLE_S:
+            if ready and time.monotonic() >= max(
+                steady_since + SETTLE_S, began + (0.0 if count else DISCOVERY_S)
+            ):
                 return True
             self._tick()
             time.sleep(_SLICE_S)
