@@ -9,10 +9,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
 
 from solver import InputError
 from trackvib_ros import messages as m
-from trackvib_ros.detection import TrainEvent
+from trackvib_ros.detection import Channel, TrainEvent
 from trackvib_ros.intake import Intake
 from trackvib_ros.outbox import Outbox
 from trackvib_ros.process import Setting, Stop, declare, main, transition, value
@@ -38,7 +39,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         super().__init__("detector", **arguments)
         self.failure: str | None = None
         self._intake: Intake | None = None
-        self._channels: dict[str, list[m.Channel]] = {}
+        self._channels: dict[str, list[Channel]] = {}
         self._description: Any = None
         self._inputs: list[tuple[str, Any]] = []
         self._recorder: Recorder | None = None
@@ -145,16 +146,16 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
                 if self._intake is not None:
                     self._publish(self._intake.take(topic, taken[0]))
 
-    def _listen(self, channels: dict[str, list[m.Channel]]) -> None:
+    def _listen(self, channels: dict[str, list[Channel]]) -> None:
         self._intake = Intake(channels)
         qos = m.BEST_EFFORT_STREAM if value(self, "best_effort") else m.STREAM
         for topic in channels:
 
-            def take(message: m.PointCloud2, topic: str = topic) -> None:
+            def take(message: PointCloud2, topic: str = topic) -> None:
                 if self._intake is not None:
                     self._publish(self._intake.take(topic, message))
 
-            self._inputs.append((topic, self.create_subscription(m.PointCloud2, topic, take, qos)))
+            self._inputs.append((topic, self.create_subscription(PointCloud2, topic, take, qos)))
 
     def _publish(self, events: list[TrainEvent]) -> None:
         for event in events:

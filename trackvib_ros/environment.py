@@ -87,7 +87,7 @@ def free_domain() -> int:
 
 def profile_path() -> str:
     """The shipped Fast DDS profile, with frequent announcements at the start."""
-    return str(resources.files("trackvib_ros").joinpath("config", "dds_profile.xml"))
+    return str(resources.files("trackvib_ros").joinpath("config").joinpath("dds_profile.xml"))
 
 
 def complete(environment: MutableMapping[str, str]) -> None:

@@ -22,7 +22,7 @@ from trackvib_ros.process import (
     transition,
     value,
 )
-from trackvib_ros.run import Run
+from trackvib_ros.run import Component, Run
 from trackvib_ros.station import Station, reseeded
 
 DAY = 86400.0
@@ -161,7 +161,9 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
 
     def _report(self) -> None:
         if self._run is None:
-            components = [("simulation", self.failure, {"state": "not configured"})]
+            components: list[Component] = [
+                ("simulation", self.failure, {"state": "not configured"})
+            ]
         else:
             components = self._run.components()
         stamp = 0 if self._run is None else self._run.time_ns

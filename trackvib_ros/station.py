@@ -111,7 +111,7 @@ class Station:
         self._known = 0
         self._coming: list[tuple[int, int, PassageTruth]] = []
         self._present: list[PassageTruth] = []
-        # the first step loads the compiled kernel, which takes seconds: better now than while running
+        # the first step loads the compiled kernel for seconds: better now than while running
         self._first: StationStep | None = self._compute()
 
     @property

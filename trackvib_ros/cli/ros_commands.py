@@ -48,7 +48,7 @@ def demo(
         name = scenario
     else:
         name, scenario = Path(scenario).stem, str(Path(scenario).resolve())
-    directory = output or Path(f"{name}_{datetime.now():%Y-%m-%d_%H-%M-%S}")
+    directory = output or Path(f"trackvib_demo_{name}_{datetime.now():%Y-%m-%d_%H-%M-%S}")
     if directory.exists():
         raise InputError(f"{directory} exists: name another directory with -o")
     os.environ["ROS_DOMAIN_ID"] = str(environment.free_domain() if domain is None else domain)
@@ -79,7 +79,7 @@ def _node(module: str, parameters: dict[str, object], namespace: str) -> None:
     if module == "sensor":
         from trackvib_ros.sensor_node import SensorNode as Node
     else:
-        from trackvib_ros.detector_node import DetectorNode as Node  # type: ignore[assignment]
+        from trackvib_ros.detector_node import DetectorNode as Node
     raise typer.Exit(run(Node, arguments))
 
 
