@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
+import os
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +16,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from solver import InputError
+from trackvib_ros import environment
 
 if TYPE_CHECKING:
     from trackvib_ros.bag.summary import BagSummary
@@ -68,7 +69,7 @@ def record(
     kill -9 and power cuts; on a full disk the bag is finished and valid. Reads back with
     [bold]ros2 bag[/bold], Foxglove, PlotJuggler, rosbags and [bold]trackvib info[/bold].
     """
-    _require_ros()
+    _prepare_ros()
     from trackvib_ros import recorder_node
 
     console = Console(stderr=True, highlight=False)
@@ -142,7 +143,7 @@ def replay(
     with unlimited reliable history hold the replay back, so at [bold]--rate max[/bold] a detector
     gets everything.
     """
-    _require_ros()
+    _prepare_ros()
     from trackvib_ros import replay_node
     from trackvib_ros.replay import ReplayOptions
 
@@ -340,12 +341,8 @@ def _scaled(option: str, value: float | None, factor: int, unit: str) -> int | N
     return round(value * factor)
 
 
-def _require_ros() -> None:
-    try:
-        import rclpy  # noqa: F401
-    except ImportError as failure:
-        raise InputError(
-            "this command needs ROS 2 (rclpy cannot be imported: "
-            f"{failure}): install it with  {sys.executable} -m pip install 'trackvib[ros]'  "
-            "or source your ROS 2 installation"
-        ) from None
+def _prepare_ros() -> None:
+    """Check the installation; the discovery range stays the user's: others may be far away."""
+    environment.require_ros()
+    environment.domain_of(os.environ)
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", environment.profile_path())
