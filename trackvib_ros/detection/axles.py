@@ -30,7 +30,7 @@ _COVERED = 0.6  # part of a wheelset's window that must have been measured
 class AxleFit:
     """Wheelsets of one train at one or several rail channels.
 
-    Arrays have shape (channels, wheelsets): time (s), residual (m), contrast (ln of the energy at
+    Arrays have shape (channels, wheelsets): time (s), residual (m, channel offset removed), contrast (ln of the energy at
     the wheelset over that beside it), observed.
     """
 
@@ -40,7 +40,8 @@ class AxleFit:
     residual: Array
     contrast: Array
     observed: NDArray[np.bool_]
-    pulses: tuple[Array, ...]
+    offset: Array
+    prior_cost: float
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -160,9 +161,7 @@ def fit_axles(
     shape = (len(traces), count)
     time, contrast = np.zeros(shape), np.zeros(shape)
     observed = np.zeros(shape, dtype=bool)
-    pulses: list[Array] = []
     for round_ in range(_ROUNDS):
-        pulses = []
         for k, trace in enumerate(traces):
             energy, covered = _windows(trace, motion, places[k], half)
             if round_ == 0 and free_start:
@@ -171,7 +170,6 @@ def fit_axles(
                 predicted = np.zeros(count)
                 pulse = _pulse(energy, predicted, trace.noise, classes)
                 shift = _best_shift(energy, pulse[classes], trace.noise, min(reach, 0.6))
-                pulses.append(pulse)
             centre = motion.time_at(places[k])
             speed = np.maximum(motion.speed_at(centre), 0.5)
             time[k] = centre + shift / speed
@@ -186,7 +184,8 @@ def fit_axles(
         flat_place = np.stack(list(places))[observed]
         if flat_time.size < 4:
             break
-        fit = regress(flat_time, flat_place, np.ones(flat_time.size), motion.epoch)
+        channel = np.nonzero(observed)[0]
+        fit = regress(flat_time, flat_place, channel, motion.epoch)
         motion = fit.motion
         if motion.speed < 1.0:
             break
@@ -200,5 +199,6 @@ def fit_axles(
         residual=residual,
         contrast=contrast,
         observed=observed,
-        pulses=tuple(pulses),
+        offset=fit.offset if fit is not None else np.zeros(len(traces)),
+        prior_cost=fit.prior_cost if fit is not None else float("inf"),
     )

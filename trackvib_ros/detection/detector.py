@@ -24,6 +24,8 @@ _LOOKAHEAD_NS = 30_000_000  # a short hole is closed by samples this far ahead
 _CHUNK_NS = 1_000_000_000
 _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
+_RISE = 10.0  # a train on rails that still ring
+_FADED = 1 / 300  # of the strongest level of an event: what is left is no train
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
@@ -74,8 +76,8 @@ class _Event:
     start_ns: int
     triggered: set[int]
     last_ns: dict[int, int]
+    strongest: dict[int, float]
     truncated: bool = False
-    first_ratio: float = 1.0
 
 
 class TrainDetector:
@@ -116,6 +118,7 @@ class TrainDetector:
         self._start_ns: int | None = None
         self._done_ns = 0
         self._event: _Event | None = None
+        self._lowest = np.full(len(self.channels), np.inf)
         self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
 
     def process(self, block: Waveform) -> list[TrainEvent]:
@@ -143,8 +146,7 @@ class TrainDetector:
         events += self._frames(2**62)
         if self._event is not None:
             now = max((g.stream.end_ns or 0 for g in self._groups.values()), default=0)
-            last = max(self._event.last_ns.values())
-            events += self._close(now, truncated_end=now - last < 300_000_000)
+            events += self._close(now)
         return events
 
     def _group_of(self, block: Waveform) -> _Group:
@@ -222,27 +224,40 @@ class TrainDetector:
         events: list[TrainEvent] = []
         for local in np.flatnonzero(active):
             channel = group.index[local]
-            rested = now_ns - self._active_ns[channel] > _REARM_NS
-            self._active_ns[channel] = now_ns
-            if self._event is None and rested:
+            level = float(group.trigger.level[local])
+            if self._event is None and self._fresh(channel, level, now_ns):
                 start = now_ns - round(FRAME * group.stream.step * 1e9)
-                self._event = _Event(start, set(), {})
-                self._event.first_ratio = float(group.trigger.ratio[local])
-                events.append(report.arrival(self.channels[channel], start, self._event.first_ratio))
+                self._event = _Event(start, set(), {}, {})
+                ratio = float(group.trigger.ratio[local])
+                events.append(report.arrival(self.channels[channel], start, ratio))
+            self._active_ns[channel] = now_ns
             if self._event is not None:
+                strongest = max(level, self._event.strongest.get(channel, 0.0))
+                self._event.strongest[channel] = strongest
                 self._event.triggered.add(channel)
-                self._event.last_ns[channel] = now_ns
+                if level > _FADED * strongest:
+                    self._event.last_ns[channel] = now_ns
+        if self._event is None:
+            self._lowest[group.index] = np.minimum(
+                self._lowest[group.index], np.maximum(group.trigger.level, 1.0)
+            )
         if self._event is None:
             return events
         last = self._deciding_last(self._event)
         if now_ns - last > self.config.hang * 1e9:
             events += self._close(now_ns)
         elif now_ns - self._event.start_ns > self.config.max_event * 1e9:
-            events += self._close(now_ns, too_long=True)
+            events += self._close(now_ns)
             for other in self._groups.values():
                 for local in range(len(other.index)):
                     other.trigger.relearn(local)
         return events
+
+    def _fresh(self, channel: int, level: float, now_ns: int) -> bool:
+        """Whether the activity of a channel is new, not what an earlier train left ringing."""
+        if now_ns - self._active_ns[channel] > _REARM_NS:
+            return True
+        return self.channels[channel].layer == "rail" and level > _RISE * self._lowest[channel]
 
     def _deciding_last(self, event: _Event) -> int:
         """Last activity of the layer nearest to the wheels: a bridge rings on for seconds."""
@@ -252,12 +267,11 @@ class TrainDetector:
                 return max(times)
         return event.start_ns
 
-    def _close(
-        self, now_ns: int, truncated_end: bool = False, too_long: bool = False
-    ) -> list[TrainEvent]:
+    def _close(self, now_ns: int) -> list[TrainEvent]:
         event = self._event
         assert event is not None
         self._event = None
+        self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
         records = []
         for group in self._groups.values():
@@ -273,7 +287,6 @@ class TrainDetector:
             (last - origin) * 1e-9 + 0.3,
         )
         flags = ["truncated_start"] if event.truncated else []
-        flags += ["truncated_end"] if truncated_end else []
         limits = (self.config.min_speed, self.config.max_speed)
         found = find_passages(records, within, self.catalogue, limits, event.truncated)
         return report.closing(self.catalogue, records, origin, within, found, flags)

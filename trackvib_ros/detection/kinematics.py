@@ -21,6 +21,11 @@ PRIOR_ACCELERATION = 0.6
 """Prior standard deviation of the acceleration (m/s²): short records cannot show it."""
 
 
+POSITION_SIGMA = 0.05
+"""Standard deviation (m) of the place where a rail sensor seems to be; of rail passages computed
+with sensors at different places in a bay."""
+
+
 @dataclass(frozen=True)
 class Motion:
     """State at ``epoch`` (s): distance (m), speed (m/s), acceleration (m/s²), with covariance."""
@@ -78,12 +83,23 @@ class Motion:
 
 @dataclass(frozen=True)
 class Fit:
-    """A regression: motion, residuals (m) in the order of the data, robust scale, weights."""
+    """A regression.
+
+    Attributes:
+        motion: solution.
+        residual: of every point (m).
+        scale: standard deviation of the residuals (m).
+        weight: 0 to 1 per point.
+        offset: of every channel (m).
+        prior_cost: squared distance of the solution from its priors, in standard deviations.
+    """
 
     motion: Motion
     residual: Array
     scale: float
     weight: Array
+    offset: Array
+    prior_cost: float
 
 
 def robust_scale(residual: Array, parameters: int) -> float:
@@ -97,42 +113,47 @@ def robust_scale(residual: Array, parameters: int) -> float:
 def regress(
     time: Array,
     place: Array,
-    noise: Array,
+    channel: NDArray[np.int64],
     epoch: float,
     prior_acceleration: float = PRIOR_ACCELERATION,
+    position_sigma: float = POSITION_SIGMA,
     least_scale: float = 0.02,
 ) -> Fit:
-    """Huber regression of ``place`` (m) on ``time`` (s) with relative noise per point.
+    """Huber regression of ``place`` (m) on ``time`` (s), points of several channels together.
 
-    The prior N(0, prior²) on the acceleration enters as one more observation. The covariance is
-    scaled by the weighted residual variance, never below ``least_scale`` (m), the geometric
-    tolerance of a train.
+    Every channel but the first has an offset with prior N(0, 2 position_sigma²): a rail answers a
+    wheel a few centimetres before or after it, according to where the sensor is in its bay. The
+    acceleration has the prior N(0, prior_acceleration²). Priors enter as observations. The
+    covariance is scaled by the weighted residual variance, never below ``least_scale`` (m), the
+    geometric tolerance of a train.
     """
     t = time - epoch
-    design = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
+    groups = np.unique(channel)[1:]
+    columns = [np.ones_like(t), t, 0.5 * t * t, *((channel == g).astype(float) for g in groups)]
+    design = np.stack(columns, axis=1)
+    sigmas = np.array([np.inf, np.inf, prior_acceleration] + [2**0.5 * position_sigma] * len(groups))
     weight = np.ones_like(t)
-    solution = np.zeros(3)
+    solution = np.zeros(len(columns))
     scale = least_scale
-    normal = np.eye(3)
+    normal = np.eye(len(columns))
     residual = np.zeros_like(t)
     for _ in range(12):
-        w = weight / noise**2
-        prior = np.diag([0.0, 0.0, (scale / prior_acceleration) ** 2])
-        normal = (design * w[:, None]).T @ design + prior
-        updated = np.linalg.solve(normal, design.T @ (w * place))
+        normal = (design * weight[:, None]).T @ design + np.diag((scale / sigmas) ** 2)
+        updated = np.linalg.solve(normal, design.T @ (weight * place))
         residual = place - design @ updated
-        scale = max(robust_scale(residual / noise, 3), least_scale)
-        relative = np.abs(residual) / (noise * scale)
+        scale = max(robust_scale(residual, 3), least_scale)
+        relative = np.abs(residual) / scale
         weight = np.minimum(1.0, 1.5 / np.maximum(relative, 1e-12))
         weight[relative > 5] = 0.0
         if np.allclose(updated, solution, rtol=1e-10, atol=1e-9):
             break
         solution = updated
     freedom = max(float(np.sum(weight)) - 3, 1.0)
-    variance = float(np.sum(weight * (residual / noise) ** 2)) / freedom
-    scale = max(float(np.sqrt(variance)), least_scale)
-    covariance = np.linalg.inv(normal) * scale**2
-    motion = Motion(
-        epoch, float(solution[0]), float(solution[1]), float(solution[2]), covariance
-    )
-    return Fit(motion, residual, scale, weight)
+    scale = max(float(np.sqrt(np.sum(weight * residual**2) / freedom)), least_scale)
+    normal = (design * weight[:, None]).T @ design + np.diag((scale / sigmas) ** 2)
+    covariance = (np.linalg.inv(normal) * scale**2)[:3, :3]
+    motion = Motion(epoch, float(solution[0]), float(solution[1]), float(solution[2]), covariance)
+    offset = np.zeros(channel.max() + 1)
+    offset[groups] = solution[3:]
+    cost = float(np.sum((solution[2:] / sigmas[2:]) ** 2))
+    return Fit(motion, residual, scale, weight, offset, cost)

@@ -36,7 +36,15 @@ def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
 
 
 class Trigger:
-    """Noise floor and activity of the channels of one group, frame by frame."""
+    """Noise floor and activity of the channels of one group, frame by frame.
+
+    Attributes:
+        floor: energy of the noise, (channels, bands).
+        ratio: energy over threshold, the largest of windows and bands, per channel.
+        level: energy of the longest window over the floor, the largest of the bands.
+        active: ``ratio`` > 1.
+        fall_db: by how much the floor has fallen since it was first learned.
+    """
 
     def __init__(
         self, channels: int, bands: tuple[tuple[float, float], ...], frame_s: float
@@ -48,6 +56,7 @@ class Trigger:
         self.active = np.zeros(channels, dtype=bool)
         self.seen = np.zeros(channels, dtype=np.int64)
         self.fall_db = np.zeros(channels)
+        self.level = np.ones(channels)
         self._history = np.zeros((WINDOWS[-1], *shape))
         self._filled = np.zeros(channels, dtype=np.int64)
         self._warm = np.full((_WARM_UP, *shape), np.nan)
@@ -86,20 +95,18 @@ class Trigger:
         with np.errstate(invalid="ignore"):
             excess = np.zeros(len(ready))
             for w, frames in enumerate(WINDOWS):
-                mean = self._history[:frames].mean(axis=0)
-                np.maximum(
-                    excess, np.nanmax(mean / self.floor / self.thresholds[w], axis=1, initial=0.0),
-                    out=excess,
-                )
+                mean = self._history[:frames].mean(axis=0) / self.floor
+                peak = np.nanmax(mean / self.thresholds[w], axis=1, initial=0.0)
+                np.maximum(excess, peak, out=excess)
+            self.level = np.nanmax(mean, axis=1, initial=0.0)
         self.ratio = np.where(usable & ready, excess, 0.0)
         self.active = self.ratio > 1.0
         learn = usable & ready & ~self.active
-        slow = energy[learn] / self.floor[learn]
-        if not frozen:
-            weight = np.where(slow > 1, 1 / _FLOOR_FRAMES, 1 / _FLOOR_FRAMES)
+        if not frozen and learn.any():
+            relative = energy[learn] / self.floor[learn]
             quiet = self._history[:, learn].mean(axis=0) / self.floor[learn]
-            weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, weight)
-            self.floor[learn] *= np.maximum(1 + weight * (np.minimum(slow, 4.0) - 1), 0.5)
+            weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, 1 / _FLOOR_FRAMES)
+            self.floor[learn] *= 1 + weight * (np.minimum(relative, 4.0) - 1)
             self.fall_db[learn] = np.max(
                 10 * np.log10(self._first_floor[learn] / self.floor[learn]), axis=1
             )

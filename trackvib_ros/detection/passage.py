@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axles import AxleFit, fit_axles
+from .blind import Blind, describe
 from .catalogue import Catalogue, TrainType
 from .events import Channel
 from .features import Window
-from .kinematics import Motion, robust_scale
-from .pattern import Match, Trace, scan
+from .kinematics import POSITION_SIGMA, Motion, robust_scale
+from .pattern import Match, Trace, refine, scan
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,16 @@ CONFIRM_SCORE = 0.60
 KNOWN_SCORE = 0.70
 """Least pattern correlation at which a catalogue type is named."""
 
+CONFIRM_CORRELATION = 0.6
+"""Least correlation of the envelopes of two channels for a train of unknown type."""
+
+HOPELESS_SCORE = 0.40
+"""Coarse correlation below which no pattern is worth refining."""
+
 _POSTERIOR_TEMPER = 0.7  # residuals of neighbouring wheelsets are not quite independent
 _SCORE_WEIGHT = 120.0
+_SCORE_NOISE = 0.03  # scores of equally right types differ by this much
+_MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,33 @@ class Hypothesis:
         return self.train.oriented(self.reverse)
 
     @property
+    def misfit(self) -> bool:
+        """Whether wheelsets in the same place of a car are off by the same amount.
+
+        Residuals are averaged over the wheelsets with the same distances to their neighbours; a
+        wrong type leaves means of several centimetres where noise would average out.
+        """
+        gaps = np.round(np.diff(self.places, prepend=-99.0, append=self.places[-1] + 99.0), 1)
+        keys = [f"{a} {b}" for a, b in zip(gaps[:-1], gaps[1:], strict=True)]
+        good = self.fit.observed & (np.abs(self.fit.residual) < 0.5)
+        square, chi2, total, within = 0.0, 0.0, 0, 0.0
+        groups = []
+        for key in set(keys):
+            members = np.array([k == key for k in keys])
+            values = self.fit.residual[:, members][good[:, members]]
+            if values.size >= 4:
+                groups.append(values)
+                within += float(np.sum((values - values.mean()) ** 2))
+                total += values.size
+        if total <= len(groups) or not groups:
+            return False
+        variance = max(within / (total - len(groups)), 0.01**2)
+        for values in groups:
+            square += values.size / total * float(values.mean()) ** 2
+            chi2 += values.size * float(values.mean()) ** 2 / variance
+        return bool(square > _MISFIT_M**2 and chi2 > _MISFIT_CHI2)
+
+    @property
     def mid_time(self) -> float:
         """Time at which the middle of the train passes the reference point (s)."""
         return float(self.fit.motion.time_at(0.5 * self.train.span))
@@ -78,11 +114,51 @@ class Passage:
     clock_offset: tuple[tuple[str, float, float], ...] = ()
     delay: tuple[float, float] | None = None
     quality: tuple[str, ...] = ()
+    coarse_score: float = 0.0
+    blind: Blind | None = None
 
     @property
     def score(self) -> float:
         """Pattern correlation of the best hypothesis."""
-        return self.hypotheses[0].score if self.hypotheses else 0.0
+        return self.hypotheses[0].score if self.hypotheses else self.coarse_score
+
+    @property
+    def known(self) -> bool:
+        """Whether a catalogue type explains the pattern."""
+        return (
+            bool(self.hypotheses)
+            and self.score >= KNOWN_SCORE
+            and not self.hypotheses[0].misfit
+            and not self.contradicted
+        )
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the delay between channels excludes the scale of every probable type."""
+        if self.delay is None:
+            return False
+        speed, sigma = self.delay
+        for h in self.hypotheses:
+            if h.probability > 0.01:
+                other = float(h.fit.motion.speed_at(h.mid_time))
+                if abs(speed - other) < max(4 * sigma, 0.006 * speed):
+                    return False
+        return True
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether this is a train: by its pattern, or by what two channels agree on."""
+        if self.hypotheses and self.score >= CONFIRM_SCORE:
+            return True
+        blind = self.blind
+        return (
+            blind is not None
+            and blind.direction != 0
+            and blind.correlation >= CONFIRM_CORRELATION
+            and blind.regular >= 0.7
+            and blind.times.size >= 8
+            and blind.speed[1] < 0.05 * blind.speed[0]
+        )
 
 
 def traces_of(record: Record, within: tuple[float, float]) -> list[Trace]:
@@ -172,7 +248,9 @@ def _scan_channel(
         found = _Scanned(trace, band, interval, matches)
         if best is None or found.score > best.score:
             best = found
-    return best
+    if best is None or best.score < HOPELESS_SCORE:
+        return best
+    return replace(best, matches=refine(best.trace, best.matches, best.interval))
 
 
 def _motion(match: Match) -> Motion:
@@ -220,9 +298,23 @@ def find_passage(
     ]
     reference = usable[0]
     interval = reference.interval
-    if not reference.matches:
-        return Passage(interval, tuple(s.trace for s in usable), reference.band, (), 0)
-    return _fit_hypotheses(usable, reference)
+    if reference.score < HOPELESS_SCORE:
+        traces = tuple(s.trace for s in scanned)
+        passage = Passage(
+            interval, traces, reference.band, (), 0, coarse_score=reference.score
+        )
+    else:
+        passage = _fit_hypotheses(usable, reference)
+    if passage.known:
+        return passage
+    # an unknown type scales the pattern: then a delay that does not fit accuses no clock
+    passage = replace(passage, clock_offset=(), quality=())
+    guess = None
+    if passage.hypotheses:
+        best = passage.hypotheses[0]
+        guess = float(best.fit.motion.speed_at(best.mid_time))
+    blind = describe([s.trace for s in scanned], scanned[0].interval, limits, guess)
+    return replace(passage, blind=blind)
 
 
 def _direction(
@@ -300,13 +392,18 @@ def ranked(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """
     if not hypotheses:
         return []
-    least = min(h.fit.scale for h in hypotheses)
+    # residuals of different hypotheses must be compared with the same outliers
+    spreads = []
+    for h in hypotheses:
+        residual = np.clip(h.fit.residual[h.fit.observed], -0.4, 0.4)
+        spreads.append(float(np.sqrt(np.mean(residual**2) + 0.02**2)))
+    least = min(spreads)
     top = max(h.score for h in hypotheses)
     logs = []
-    for h in hypotheses:
+    for h, spread in zip(hypotheses, spreads, strict=True):
         count = int(h.fit.observed.sum())
-        log = -_POSTERIOR_TEMPER * count * np.log(h.fit.scale / least)
-        logs.append(log - _SCORE_WEIGHT * max(0.0, top - h.score - 0.01))
+        log = -_POSTERIOR_TEMPER * count * np.log(spread / least) - 0.5 * h.fit.prior_cost
+        logs.append(log - _SCORE_WEIGHT * max(0.0, top - h.score - _SCORE_NOISE))
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
     out = [replace(h, probability=float(p)) for h, p in zip(hypotheses, weights, strict=True)]
@@ -338,8 +435,9 @@ def delay_speed(passage: Passage) -> tuple[float, float] | None:
     good = np.abs(ratio - centre) < 4 * spread
     mean = float(ratio[good].mean())
     sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
-    speed = float(fit.motion.speed_at(best.mid_time))
-    return speed / mean, speed * sigma / mean**2
+    speed = float(fit.motion.speed_at(best.mid_time)) / mean
+    baseline = 2**0.5 * POSITION_SIGMA / (x[b] - x[a])
+    return speed, speed * float(np.hypot(sigma / mean, baseline))
 
 
 def _excited(record: Record, within: tuple[float, float]) -> bool:
@@ -388,7 +486,7 @@ def _divided(
         parts = []
         for half, cut in zip(halves, (truncated, False), strict=True):
             part = find_passage(rails, half, catalogue.types, limits, cut)
-            if part is None or part.score < CONFIRM_SCORE:
+            if part is None or not part.confirmed:
                 break
             parts.append(part)
         if len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1:

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 DYNAMIC_RANGE = 300.0
 """Energy range below the strong axles that counts (25 dB)."""
 
+_COARSE = 1.8  # m, smoothing of the first pass
+_COARSE_BEND = 2.0  # m
+_SPEED_STEP = 0.016
 _CELL = 0.5  # m
 _BACKGROUND = 8.0  # m, what is smoother than this is no axle pattern
 
@@ -215,9 +218,8 @@ def scan(
     trains: Sequence[TrainType],
     limits: tuple[float, float],
     stretch: tuple[float, float] = (0.80, 1.25),
-    keep: int = 8,
 ) -> list[Match]:
-    """Best matches of the types in a trace, at most one per type and orientation, best first.
+    """Coarse best matches of the types, at most one per type and orientation, best first.
 
     Args:
         trace: the rail channel.
@@ -225,7 +227,6 @@ def scan(
         trains: candidate types.
         limits: lowest and highest speed (m/s).
         stretch: speeds tried, as fractions of span / duration of the interval.
-        keep: how many to refine.
     """
     start, stop = interval
     duration = max(stop - start, 0.2)
@@ -246,52 +247,45 @@ def scan(
     ranges = [ranges[j] for j in usable]
     low = min(r[0] for r in ranges)
     high = max(r[1] for r in ranges)
-    coarse = 1.8
     best: dict[tuple[str, bool], Match] = {}
-    speed_step = 0.016
-    bends = _accelerations(duration, 2.0)
-    for acceleration in bends:
+    for acceleration in _accelerations(duration, _COARSE_BEND):
         for match in _scan_once(
             trace,
             epoch,
             duration,
             oriented,
             ranges,
-            _grid(low, high, speed_step),
+            _grid(low, high, _SPEED_STEP),
             float(acceleration),
-            coarse,
+            _COARSE,
         ):
             key = (match.train.name, match.reverse)
             if key not in best or match.score > best[key].score:
                 best[key] = match
-    top = sorted(best.values(), key=lambda m: -m.score)[:keep]
+    return sorted(best.values(), key=lambda m: -m.score)
+
+
+def refine(
+    trace: Trace, matches: Sequence[Match], interval: tuple[float, float], keep: int = 8
+) -> list[Match]:
+    """The best coarse matches with finer speeds, accelerations and smoothing, best first."""
+    if not matches:
+        return []
+    duration = max(interval[1] - interval[0], 0.2)
+    bends = _accelerations(duration, _COARSE_BEND)
     bend = float(bends[1] - bends[0]) if bends.size > 1 else 0.0
-    return sorted(
-        (_refine(trace, match, duration, speed_step, bend) for match in top),
-        key=lambda m: -m.score,
-    )
+    near = [m for m in matches if m.score > matches[0].score - 0.25][:keep]
+    return sorted((_refine(trace, m, duration, bend) for m in near), key=lambda m: -m.score)
 
 
-def _refine(
-    trace: Trace, match: Match, duration: float, speed_step: float, bend: float
-) -> Match:
-    """Finer speeds, accelerations and smoothing about a coarse match."""
-    best = Match(
-        -1.0,
-        match.train,
-        match.reverse,
-        match.start,
-        match.epoch,
-        match.speed,
-        match.acceleration,
-    )
+def _refine(trace: Trace, match: Match, duration: float, bend: float) -> Match:
+    best, top = match, -1.0
     for sigma, spread, points in ((1.1, 1.0, 4), (0.7, 0.35, 3)):
-        centre = best if best.score > 0 else match
+        centre, top = best, -1.0
         offsets = np.linspace(-spread, spread, 2 * points + 1)
         bends = [0.0] if bend == 0 else list(spread * bend * np.linspace(-1, 1, 5))
-        speeds = centre.speed * (1 + speed_step * offsets)
+        speeds = centre.speed * (1 + _SPEED_STEP * offsets)
         limit = [(0.5 * centre.speed, 2 * centre.speed)]
-        level = -1.0
         for offset in bends:
             for found in _scan_once(
                 trace,
@@ -303,6 +297,6 @@ def _refine(
                 centre.acceleration + float(offset),
                 sigma,
             ):
-                if found.score > level:
-                    best, level = found, found.score
+                if found.score > top:
+                    best, top = found, found.score
     return best

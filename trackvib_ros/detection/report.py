@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
-from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage, Record
+from .blind import Blind
+from .kinematics import POSITION_SIGMA
+from .passage import CONFIRM_SCORE, Hypothesis, Passage, Record
+
+Array = NDArray[np.float64]
 
 _DIRECTION = {1: "forward", -1: "backward", 0: "unknown"}
 _UNITS = {1: "single", 2: "double"}
+_UNKNOWN_SCALE = 0.02  # relative error of the speed when the nearest type stands for an unknown one
+_PULSE_SIGMA_S, _PULSE_SIGMA_M = 0.0015, POSITION_SIGMA  # centre of a pulse against its wheelset
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
 
 
@@ -38,7 +45,7 @@ def closing(
 ) -> list[TrainEvent]:
     """The events at the end of an event: per train its wheelsets, departure and summary."""
     events: list[TrainEvent] = []
-    trains = [passage for passage in found if passage.score >= CONFIRM_SCORE]
+    trains = [passage for passage in found if passage.confirmed]
     if not trains:
         names = tuple(r.channel.name for r in records)
         return [
@@ -57,8 +64,45 @@ def closing(
             )
         ]
     for passage in trains:
-        events += _train(catalogue, records, origin_ns, passage, flags)
+        quality = [*flags, *passage.quality, *_window_flags(records, passage)]
+        use_blind = passage.blind is not None and (
+            passage.contradicted or passage.score < CONFIRM_SCORE or passage.blind.direction != 0
+        )
+        if not passage.known and use_blind:
+            assert passage.blind is not None
+            events += _unknown(catalogue, origin_ns, passage, passage.blind, quality)
+        else:
+            events += _train(catalogue, origin_ns, passage, quality)
     return events
+
+
+def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
+    """Flags from the samples: clipped, gaps, record shorter than the train."""
+    flags = set()
+    start, stop = passage.interval
+    for record in records:
+        window = record.window
+        inside = (window.time >= start) & (window.time <= stop)
+        if record.channel.layer != "rail" or not inside.any():
+            continue
+        if clipped(window.peak[inside], window.flat[inside]):
+            flags.add("clipped")
+        if np.mean(window.holes[inside]) > 0.002 or not window.valid[inside].all():
+            flags.add("gaps")
+        if start - window.time[0] < 0.15:
+            flags.add("truncated_start")
+        if window.time[-1] - stop < 0.15:
+            flags.add("truncated_end")
+    return sorted(flags)
+
+
+def clipped(peak: Array, flat: Array) -> bool:
+    """Whether samples pile up at the largest magnitude: equal neighbours there, not elsewhere."""
+    top = float(peak.max(initial=0.0))
+    if top <= 0:
+        return False
+    extreme = peak > 0.995 * top
+    return bool(extreme.sum() >= 5 and np.median(flat[extreme]) >= 1)
 
 
 def mixture(hypotheses: Sequence[Hypothesis]) -> tuple[float, float, float]:
@@ -86,17 +130,15 @@ def families(hypotheses: Sequence[Hypothesis]) -> tuple[tuple[str, float], ...]:
 
 def _train(
     catalogue: Catalogue,
-    records: Sequence[Record],
     origin_ns: int,
     passage: Passage,
-    flags: Sequence[str],
+    quality: Sequence[str],
 ) -> list[TrainEvent]:
     best = passage.hypotheses[0]
     fit, train = best.fit, best.train
     motion = fit.motion
     names = tuple(trace.name for trace in passage.traces)
     method = "axle pattern" if len(names) == 1 else "axle pattern and delay, joint regression"
-    quality = [*flags, *passage.quality]
     places = best.places
 
     def stamp(time: float) -> int:
@@ -116,7 +158,7 @@ def _train(
             TrainEvent(
                 kind="axle",
                 stamp_ns=stamp(time),
-                sigma_s=float(axle_sigma[i]),
+                sigma_s=float(np.hypot(axle_sigma[i], _PULSE_SIGMA_S)),
                 confidence=float(np.clip(confidence, 0.01, 0.99)),
                 method="pulse shift by maximum likelihood" if seen else "predicted by the motion",
                 sensors=(reference.name,),
@@ -125,18 +167,22 @@ def _train(
         )
     first, last = float(motion.time_at(places[0])), float(motion.time_at(places[-1]))
     speed, own, sigma = mixture(passage.hypotheses)
-    known = best.score >= KNOWN_SCORE
-    passing_sigma = float(
-        np.hypot(motion.time_sigma(first), motion.time_sigma(last))
-    )
+    known = passage.known
+    if not known:
+        sigma = max(sigma, _UNKNOWN_SCALE * speed)
+        quality = [*quality, "unknown_type"]
+    passing_sigma = float(np.hypot(motion.time_sigma(first), motion.time_sigma(last)))
+    systematic = float(np.hypot(_PULSE_SIGMA_S, _PULSE_SIGMA_M / speed))
+    first_sigma = float(np.hypot(motion.time_sigma(first), systematic))
+    last_sigma = float(np.hypot(motion.time_sigma(last), systematic))
     values: dict[str, Value] = {
         "grade": CONFIRMED,
         "reference": reference.name,
         "reference_x": Estimate(reference.x, 0.0, "m"),
         "arrival_ns": stamp(first),
-        "arrival_sigma": motion.time_sigma(first),
+        "arrival_sigma": first_sigma,
         "departure_ns": stamp(last),
-        "departure_sigma": motion.time_sigma(last),
+        "departure_sigma": last_sigma,
         "passing_time": Estimate(last - first, passing_sigma, "s"),
         "speed": Estimate(speed, sigma, "m/s"),
         "speed_at": "middle of the train at the reference point",
@@ -169,7 +215,7 @@ def _train(
         TrainEvent(
             kind="departure",
             stamp_ns=stamp(last),
-            sigma_s=motion.time_sigma(last),
+            sigma_s=last_sigma,
             confidence=confidence,
             method=method,
             sensors=names,
@@ -181,7 +227,7 @@ def _train(
         TrainEvent(
             kind="passage",
             stamp_ns=stamp(first),
-            sigma_s=motion.time_sigma(first),
+            sigma_s=first_sigma,
             confidence=confidence,
             method=method,
             sensors=names,
@@ -189,4 +235,86 @@ def _train(
             quality=tuple(quality),
         )
     )
+    return events
+
+
+def _unknown(
+    catalogue: Catalogue,
+    origin_ns: int,
+    passage: Passage,
+    blind: Blind,
+    quality: Sequence[str],
+) -> list[TrainEvent]:
+    """A train that no type explains: what was seen, and no more."""
+    quality = (*quality, "unknown_type")
+    if blind.regular < 0.8:
+        quality = (*quality, "axle_count_not_confident")
+    speed, sigma = blind.speed
+    times = blind.times
+    grade = CONFIRMED if passage.confirmed else VIBRATION
+    confidence = float(np.clip(max(blind.correlation, passage.score), 0.0, 0.95))
+
+    def stamp(time: float) -> int:
+        return origin_ns + round(time * 1e9)
+
+    time_sigma = float(np.hypot(0.3 / speed, _PULSE_SIGMA_S))
+    events = [
+        TrainEvent(
+            kind="axle",
+            stamp_ns=stamp(float(time)),
+            sigma_s=time_sigma,
+            confidence=0.9 * blind.regular,
+            method="energy peak",
+            sensors=blind.sensors[:1],
+            values={"number": number},
+        )
+        for number, time in enumerate(times, 1)
+    ]
+    spacings = blind.spacings
+    span = float(spacings.sum())
+    duration = float(times[-1] - times[0])
+    acceleration = Estimate(
+        blind.motion.acceleration, blind.motion.acceleration_sigma, "m/s^2"
+    )
+    values: dict[str, Value] = {
+        "grade": grade,
+        "reference": blind.sensors[0],
+        "reference_x": Estimate(blind.x, 0.0, "m"),
+        "arrival_ns": stamp(float(times[0])),
+        "arrival_sigma": time_sigma,
+        "departure_ns": stamp(float(times[-1])),
+        "departure_sigma": time_sigma,
+        "passing_time": Estimate(duration, 2**0.5 * time_sigma, "s"),
+        "speed": Estimate(speed, sigma, "m/s"),
+        "speed_at": "middle of the train at the reference point",
+        "acceleration": acceleration,
+        "direction": _DIRECTION[blind.direction],
+        "axle_count": int(times.size),
+        "axle_count_confidence": round(blind.regular, 3),
+        "type": "unknown",
+        "families": families(passage.hypotheses),
+        "cars": "unknown",
+        "units": "unknown",
+        "train_length": Estimate(span, float(np.hypot(span * sigma / speed, 0.5)), "m"),
+        "axle_spacings": tuple(round(float(gap), 2) for gap in spacings),
+        "axle_spacing_sigma": round(float(np.hypot(0.3, 2.5 * sigma / speed)), 3),
+        "score": round(passage.score, 4),
+        "correlation": round(blind.correlation, 4),
+        "catalogue": catalogue.version,
+    }
+    for kind, time in (("departure", times[-1]), ("passage", times[0])):
+        events.append(
+            TrainEvent(
+                kind=kind,  # type: ignore[arg-type]
+                stamp_ns=stamp(float(time)),
+                sigma_s=time_sigma,
+                confidence=confidence,
+                method=blind.method,
+                sensors=blind.sensors,
+                values=values
+                if kind == "passage"
+                else {"grade": grade, "reference_x": Estimate(blind.x, 0.0, "m")},
+                quality=tuple(quality),
+            )
+        )
     return events
