@@ -24,10 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from .contact import force_of, solve_contact
 from .errors import SolverError
-from .modes import ModalLine
+from .modes import RESIDUAL_STEP, ModalLine
 from .traffic import Running, Traffic
 from .vehicle import UnitStep, block_units, discretise, static_start
 
@@ -510,6 +511,34 @@ FORCE_LIMIT = 1e4
 """Wheelset force per static load beyond which a run counts as diverged."""
 
 
+def one_sided_cubics(values: Array) -> Array:
+    """Cubic coefficients of evenly spaced samples: (..., P) to (..., P - 1, 4)."""
+    spline = CubicSpline(np.arange(values.shape[-1]), values, axis=-1)
+    return np.ascontiguousarray(np.moveaxis(spline.c[::-1], (0, 1), (-1, -2)))
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _dropped_answer(  # type: ignore[no-untyped-def]
+    place, force, channel_x, residual, step, answer
+):
+    cells = residual.shape[3]
+    for n in range(place.shape[0]):
+        for i in range(place.shape[1]):
+            if math.isnan(force[n, i]):
+                continue
+            for c in range(channel_x.size):
+                away = (place[n, i] - channel_x[c]) / step
+                side = 1 if away > 0.0 else 0
+                away = abs(away)
+                if away < cells:
+                    cell = int(away)
+                    s = away - cell
+                    for order in range(3):
+                        a = residual[c, order, side, cell]
+                        value = a[0] + s * (a[1] + s * (a[2] + s * a[3]))
+                        answer[n, c, order] += force[n, i] * value
+
+
 class ModalRun:
     """A run by exponential stepping: the state of modes and units, advanced in chunks.
 
@@ -541,59 +570,117 @@ class ModalRun:
         self.equilibrium_residual = 0.0
         self._order = order
         self._march = marching
+        self._derivatives = derivatives
+        self._residual = one_sided_cubics(line.channel_residual)
+        self._next = 0
+        self._held: list[Array] = []
         self._modal = np.zeros((2, self.tables.size))
         self._units: list[Running] = []
         self._fleet: Fleet | None = None
         self._steps: list[UnitStep] = []
         self._until = 0
 
+    @property
+    def next_sample(self) -> int:
+        """First sample that is not computed yet."""
+        return self._next
+
     def reconsider(self) -> None:
         """Look for units that start, because a train was added."""
         self._until = 0
 
-    def advance(self, sample: int, time: Array, position: Array) -> tuple[Array, Array]:
-        """Wheelset forces (n, W) N and channel outputs (n, O) of the samples from ``sample`` on.
+    def advance(self, samples: int) -> tuple[Array, Array, Array, Array]:
+        """The next samples: time (n,), position (n, W), force (n, W), channel outputs (n, O).
+
+        The modes are two samples ahead of what is handed out, because the answer of the dropped
+        modes is g0 + dg1/dt with sums g0, g1 over the moving forces, by central differences. The
+        derivative of the kept modes' displacement is sum(shape (lambda q + p)); its last part
+        h = sum(shape p), zero if all modes were kept, is a third such sum.
 
         Raises:
             SolverError: a force or a channel diverged.
         """
-        count = len(time)
-        force = np.full(position.shape, np.nan)
-        outputs = np.empty((count, self.tables.channel_weights.shape[1]))
-        done = 0
-        while done < count:
-            now = sample + done
-            if now >= self._until:
-                self._change_units(self.traffic.active(now), position[done], time[done])
-                self._until = self.traffic.next_change(now)
-            stop = min(count, done + CHUNK, self._until - sample)
-            self._advance_chunk(slice(done, stop), now, time, position, force, outputs)
-            done = stop
-        return force, outputs
+        first = self._next == 0
+        ahead = self._march_on(samples + 2 if first else samples)
+        held = list(self._held)
+        if first:
+            # at rest before the start
+            held = [np.repeat(part[:1], 2, axis=0) for part in ahead]
+        elif held[1].shape[1] != ahead[1].shape[1]:
+            # a train was added in between
+            held[1] = self.traffic.position(held[0])
+            more = ahead[2].shape[1] - held[2].shape[1]
+            held[2] = np.pad(held[2], ((0, 0), (0, more)), constant_values=np.nan)
+        time, position, force, outputs, answer = (
+            np.concatenate(parts) for parts in zip(held, ahead, strict=True)
+        )
+        self._held = [part[-4:].copy() for part in (time, position, force, outputs, answer)]
+        now, step = slice(2, -2), self.traffic.step
+        h, g0, g1 = np.moveaxis(answer, 2, 0)
 
-    def _advance_chunk(
-        self, part: slice, now: int, time: Array, position: Array, force: Array, outputs: Array
+        def rate(values: Array, order: int) -> Array:
+            a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
+            return (
+                values[now],
+                (c - b) / (2 * step),
+                (c - 2 * values[now] + b) / step**2,
+                (d - 2 * c + 2 * b - a) / (2 * step**3),
+            )[order]
+
+        signals = outputs[now]
+        width = answer.shape[1]
+        for number, derivative in enumerate(self._derivatives):
+            columns = slice(number * width, (number + 1) * width)
+            signals[:, columns] += rate(g0, derivative) + rate(g1, derivative + 1)
+            if derivative > 0:
+                signals[:, columns] += rate(h, derivative - 1)
+        return time[now], position[now], force[now], signals
+
+    def _march_on(self, samples: int) -> list[Array]:
+        """Time, position, force, outputs of the kept modes, sums h, g0, g1 of :meth:`advance`."""
+        time: Array = (self._next + np.arange(samples, dtype=np.float64)) * self.traffic.step
+        position = self.traffic.position(time)
+        force = np.full(position.shape, np.nan)
+        outputs = np.empty((samples, self.tables.channel_weights.shape[1]))
+        answer = np.zeros((samples, len(self.line.channel_x), 3))
+        done = 0
+        while done < samples:
+            if self._next >= self._until:
+                active = self.traffic.active(self._next)
+                self._change_units(active, position[done], time[done])
+                self._until = self.traffic.next_change(self._next)
+            stop = min(samples, done + CHUNK, done + self._until - self._next)
+            part = slice(done, stop)
+            self._march_chunk(time[part], position[part], force[part], outputs[part], answer[part])
+            self._next += stop - done
+            done = stop
+        return [time, position, force, outputs, answer]
+
+    def _march_chunk(
+        self, time: Array, position: Array, force: Array, outputs: Array, answer: Array
     ) -> None:
         assert self._fleet is not None
         columns = [c for unit in self._units for c in range(unit.columns.start, unit.columns.stop)]
-        place = np.ascontiguousarray(position[part][:, columns])
-        roughness = self.traffic.roughness(self._units, place, time[part])
-        samples = part.stop - part.start
+        place = np.ascontiguousarray(position[:, columns])
+        roughness = self.traffic.roughness(self._units, place, time)
         own_force = np.empty(place.shape)
-        history = np.empty((samples, 2 * self.tables.size))
-        feed = np.empty((samples, outputs.shape[1]))
+        history = np.empty((len(time), 2 * self.tables.size))
+        feed = np.empty(outputs.shape)
         lost, residual = self._march(
             self.tables, self._modal, self._fleet, place, roughness, own_force, history, feed
         )
-        force[part.start : part.stop, columns] = own_force
-        outputs[part] = history @ self.tables.channel_weights + feed
-        self._check(now, time[part], own_force, outputs[part])
-        loads = [unit.unit.static_loads.max() for unit in self._units]
+        force[:, columns] = own_force
+        outputs[:] = history @ self.tables.channel_weights + feed
+        _dropped_answer(
+            place, own_force, self.line.channel_x, self._residual, RESIDUAL_STEP, answer
+        )
+        self._check(time, own_force, outputs)
         self.lost_contacts += lost
-        if loads:
-            self.equilibrium_residual = max(self.equilibrium_residual, residual / max(loads))
+        if self._units:
+            load = max(unit.unit.static_loads.max() for unit in self._units)
+            self.equilibrium_residual = max(self.equilibrium_residual, residual / load)
 
-    def _check(self, now: int, time: Array, force: Array, outputs: Array) -> None:
+    def _check(self, time: Array, force: Array, outputs: Array) -> None:
         loads = [unit.unit.static_loads for unit in self._units]
         if loads:
             limit = FORCE_LIMIT * np.concatenate(loads)
@@ -609,8 +696,8 @@ class ModalRun:
                 )
         if not np.isfinite(self._modal).all() or not np.isfinite(outputs).all():
             raise SolverError(
-                f"a mode is not finite before t = {time[-1]:.6g} s (sample {now + len(time)}): "
-                "the run diverged, shorten solution.step"
+                f"a mode is not finite before t = {time[-1]:.6g} s; limit 1e308: the run "
+                "diverged, shorten solution.step"
             )
 
     def _change_units(self, active: list[Running], position: Array, time: float) -> None:

@@ -32,7 +32,7 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 5
+FORMAT = 7
 CACHE_BYTES = 2 * 2**30
 
 RESIDUAL_REACH = 3.0
@@ -64,9 +64,12 @@ class ModalLine:
         channel_shapes: (C, K); displacement, strain or force of channel c is
             ``sum(weights * Re(channel_shapes[c] * q))``.
         channel_x: (C,) position of each channel (m).
-        channel_residual: (C, 2, P) static answer of each channel per force on the rail that the
-            kept modes miss, forces at ``channel_x`` - j and + j times ``RESIDUAL_STEP``: dropped
-            modes answer a passing wheel statically, with a kink in the rail under it.
+        channel_residual: (C, 3, 2, P) for forces on the rail at ``channel_x`` - j (first) and + j
+            times ``RESIDUAL_STEP``, per force: the sum of phi phi.T over the kept modes (1/s),
+            which is zero over all modes, and what they miss of the channel's answer, per force
+            and per rate of force (s). Dropped modes answer a passing wheel almost statically:
+            ``(K + s C + ...)^-1 = K^-1 - s K^-1 C K^-1 + ...`` less the same terms of the kept
+            modes, ``-sum phi phi.T (1/lambda + s/lambda^2 + ...)``.
         channel_band: (C,) valid band of each channel (Hz).
         length: of the line (m).
         solved: number of complex modes that were computed, K of them kept.
@@ -256,9 +259,6 @@ def build_modal_line(structure: Structure) -> ModalLine:
     inverse = scipy.linalg.inv(structure.stiffness.toarray(), assume_a="pos", check_finite=False)
     static_weights = weights / -values
 
-    def kept_answer(answer: Complex, x: Array) -> Array:
-        return ((structure.rail_rows(x) @ real) @ vectors @ (static_weights * answer)).real
-
     thirds = (edges[:-1, None] + step * np.arange(4) / 3).ravel()
     residual = np.empty(len(thirds))
     for begin in range(0, len(thirds), 1024):
@@ -279,7 +279,13 @@ def build_modal_line(structure: Structure) -> ModalLine:
         residual=residual.reshape(-1, 4) @ cubic.T,
         channel_shapes=channels,
         channel_x=places,
-        channel_residual=_channel_residual(structure, inverse, channels, kept_answer),
+        channel_residual=_channel_residual(
+            structure,
+            inverse,
+            channels,
+            lambda x: (structure.rail_rows(x) @ real) @ vectors,
+            values,
+        ),
         channel_band=np.array([structure.channel_band(c) for c in scenario.channel]),
         length=structure.length,
         solved=solved,
@@ -290,23 +296,29 @@ def _channel_residual(
     structure: Structure,
     inverse: Array,
     channels: Complex,
-    kept_answer: Callable[[Complex, Array], Array],
+    rail: Callable[[Array], Complex],
+    values: Complex,
 ) -> Array:
-    """Static answers of the channels to forces near them less those of the kept modes."""
+    """Answers of the channels to forces near them, to first order in s, less those kept."""
     reach = RESIDUAL_STEP * np.arange(round(RESIDUAL_REACH / RESIDUAL_STEP) + 1)
-    value = np.zeros((len(channels), 2, len(reach)))
+    result = np.zeros((len(channels), 3, 2, len(reach)))
+    weights = np.where(values.imag > 0, 2.0, 1.0)
     for number, channel in enumerate(structure.scenario.channel):
         place = structure.scenario.channel_x(channel)
-        state = (structure.probe(channel).displacement_rows @ inverse)[0]
+        probe = structure.probe(channel)
+        static = (probe.displacement_rows @ inverse)[0]
+        rate = (probe.velocity_rows @ inverse)[0] - inverse @ (structure.damping @ static)
         for side, sign in enumerate((-1.0, 1.0)):
             loads = place + sign * reach
             on = (loads >= 0) & (loads <= structure.length)
-            answer = structure.rail_rows(loads[on]) @ state
-            answer -= kept_answer(channels[number], loads[on])
+            rows, shapes = structure.rail_rows(loads[on]), rail(loads[on])
+            for order, exact in enumerate((0 * static, static, rate)):
+                kept = shapes @ (-weights * channels[number] / values**order)
+                result[number, order, side, on] = rows @ exact - kept.real
             if channel.layer == "rail" and channel.quantity == "motion":
-                answer += structure.missing_rail_deflection(loads[on], place)
-            value[number, side, on] = answer
-    return value
+                missing = structure.missing_rail_deflection(loads[on], place)
+                result[number, 1, side, on] += missing
+    return result
 
 
 def _grid(structure: Structure) -> tuple[float, float, int]:

@@ -127,9 +127,7 @@ class Simulation:
             SolverError: the computation left its valid range.
         """
         index = self._index
-        time: Array = (index + np.arange(samples, dtype=np.float64)) * (self.step_ns * 1e-9)
-        position = self._traffic.position(time)
-        force, signals = self._run.advance(index, time, position)
+        time, position, force, signals = self._run.advance(samples)
         self._index += samples
         width = len(self.channels)
         parts: dict[Output, Array] = {
@@ -159,16 +157,19 @@ class Simulation:
             InputError: a wheelset would appear on the line out of nowhere.
         """
         train = train.model_copy(update={"start_time": start_time})
-        now = self._index * self.step_ns * 1e-9
+        now = self._run.next_sample * self.step_ns * 1e-9
         place = TrainMotion(train).position(now)
-        if self._index > 0 and ((place >= 0) & (place <= self.scenario.line.length)).any():
+        if (
+            self._run.next_sample > 0
+            and ((place >= 0) & (place <= self.scenario.line.length)).any()
+        ):
             axle = int(np.argmax((place >= 0) & (place <= self.scenario.line.length)))
             raise InputError(
                 f"train added at t = {now:.6g} s: its wheelset {axle + 1} would be at x = "
                 f"{place[axle]:.6g} m, on the line of {self.scenario.line.length:g} m already: "
                 "choose a later start_time or a start farther away"
             )
-        index = self._traffic.add(train, self._index)
+        index = self._traffic.add(train, self._run.next_sample)
         self.scenario = self.scenario.model_copy(update={"train": (*self.scenario.train, train)})
         self._run.reconsider()
         return index
