@@ -226,7 +226,8 @@ class TrainDetector:
             channel = group.index[local]
             level = float(group.trigger.level[local])
             if self._event is None and self._fresh(channel, level, now_ns):
-                start = now_ns - round(FRAME * group.stream.step * 1e9)
+                delay = group.stream.shift[group.trigger.band[local]]
+                start = now_ns - round((FRAME * group.stream.step + delay) * 1e9)
                 self._event = _Event(start, set(), {}, {})
                 ratio = float(group.trigger.ratio[local])
                 events.append(report.arrival(self.channels[channel], start, ratio))

@@ -17,12 +17,18 @@ from trackvib_ros.waveform import Waveform
 Array = NDArray[np.float64]
 
 BANDS: tuple[tuple[float, float], ...] = ((5.0, 150.0), (20.0, 400.0), (60.0, 800.0))
-"""Frequency bands (Hz) in which energy is measured; the best one is kept per passage."""
+"""Frequency bands (Hz) in which energy is measured; the best one is kept per passage.
+
+Their filters have linear phase (Bessel low-pass; delayed signal minus its moving mean as high-pass):
+the slow pulse of a wheel at 40 km/h keeps its symmetry and its place.
+"""
 
 FRAME = 10
 """Bins per decision frame: about 10 ms."""
 
 _BIN_RATE = 1000.0
+_INNER_RATE = 2500.0  # Hz, band filters run at this rate or up to twice it
+_INNER_TOP = 900.0  # Hz
 _FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
 _SETTLE_S = 0.05  # bins after a hole that the filters still remember
 _MAX_GAP_S = 5.0  # longer gaps restart the stream
@@ -67,11 +73,19 @@ def bands_for(rate: float) -> tuple[tuple[float, float], ...]:
     return kept or ((0.02 * rate, 0.45 * rate),)
 
 
-def _energy_delay(sos: Array, rate: float) -> float:
+def _dc_delay(sos: Array, rate: float) -> float:
     impulse = np.zeros(int(0.5 * rate) + 8)
     impulse[0] = 1.0
-    power = signal.sosfilt(sos, impulse) ** 2
-    return float(np.sum(np.arange(power.size) * power) / np.sum(power) / rate)
+    response = signal.sosfilt(sos, impulse)
+    return float(np.sum(np.arange(response.size) * response) / np.sum(response) / rate)
+
+
+def _moving_high_pass(low: float, rate: float) -> Array:
+    """Taps of "delayed minus moving mean": -3 dB near ``low`` (Hz), linear phase."""
+    taps = 2 * max(1, round(0.3 * rate / low)) + 1
+    out = np.full(taps, -1.0 / taps)
+    out[taps // 2] += 1.0
+    return out
 
 
 class GroupStream:
@@ -81,19 +95,30 @@ class GroupStream:
         self.channels = channels
         self.dt_ns = dt_ns
         self.rate = 1e9 / dt_ns
-        self.decimation = max(1, int(self.rate // _BIN_RATE))
+        self._first = max(1, int(self.rate // _INNER_RATE))
+        inner = self.rate / self._first
+        self.decimation = self._first * max(1, int(inner // _BIN_RATE))
         self.step = self.decimation / self.rate
         self.bands = bands_for(self.rate)
+        top = min(_INNER_TOP, 0.45 * self.rate)
+        self._front = signal.bessel(4, top, "low", norm="mag", fs=self.rate, output="sos")
         self._sos = [
-            signal.butter(2, band, "bandpass", fs=self.rate, output="sos") for band in self.bands
+            signal.bessel(3, min(high, 0.45 * inner), "low", norm="mag", fs=inner, output="sos")
+            for _, high in self.bands
         ]
-        top = min(100.0, 0.4 * self.rate)
-        bottom = min(0.3, top / 10)
-        self._low_sos = signal.butter(2, (bottom, top), "bandpass", fs=self.rate, output="sos")
-        self.shift = np.array([_energy_delay(sos, self.rate) for sos in self._sos])
-        self.low_shift = _energy_delay(
-            signal.butter(2, top, "lowpass", fs=self.rate, output="sos"), self.rate
+        self._fir = [_moving_high_pass(low, inner) for low, _ in self.bands]
+        front = _dc_delay(self._front, self.rate)
+        self.shift = np.array(
+            [
+                front + _dc_delay(sos, inner) + (len(fir) // 2) / inner
+                for sos, fir in zip(self._sos, self._fir, strict=True)
+            ]
         )
+        top = min(100.0, 0.4 * inner)
+        low_sos = signal.bessel(2, top, "low", norm="mag", fs=inner, output="sos")
+        self._sos.append(low_sos)
+        self._fir.append(np.ones(1))
+        self.low_shift = front + _dc_delay(low_sos, inner)
         self._capacity = int(keep_s / self.step)
         n = len(channels)
         columns = len(self.bands) + 5
@@ -242,18 +267,25 @@ class GroupStream:
         n, d = len(x) // self.decimation, self.decimation
         first = self._zi is None
         if self._zi is None:
-            self._zi = [
-                signal.sosfilt_zi(sos)[:, :, None] * x[0] for sos in (*self._sos, self._low_sos)
+            self._zi_front = signal.sosfilt_zi(self._front)[:, :, None] * x[0]
+            self._zi = [signal.sosfilt_zi(sos)[:, :, None] * x[0] for sos in self._sos]
+            self._zi_fir = [
+                signal.lfilter_zi(fir, 1.0)[:, None] * x[0] if fir.size > 1 else np.empty(0)
+                for fir in self._fir
             ]
             self._previous = np.full(x.shape[1], np.nan)
         shape = (n, d, x.shape[1])
         out = np.empty((n, x.shape[1], self._ring.shape[2]), dtype=np.float32)
-        for b, sos in enumerate(self._sos):
-            y, self._zi[b] = signal.sosfilt(sos, x, axis=0, zi=self._zi[b])
-            out[:, :, b] = np.square(y).reshape(shape).mean(axis=1)
-        y, self._zi[-1] = signal.sosfilt(self._low_sos, x, axis=0, zi=self._zi[-1])
-        b = len(self._sos)
-        out[:, :, b] = y.reshape(shape).mean(axis=1)
+        y, self._zi_front = signal.sosfilt(self._front, x, axis=0, zi=self._zi_front)
+        inner = np.ascontiguousarray(y[:: self._first])
+        inner_shape = (n, d // self._first, x.shape[1])
+        b = len(self.bands)
+        for k, (sos, fir) in enumerate(zip(self._sos, self._fir, strict=True)):
+            y, self._zi[k] = signal.sosfilt(sos, inner, axis=0, zi=self._zi[k])
+            if k < b:
+                y, self._zi_fir[k] = signal.lfilter(fir, 1.0, y, axis=0, zi=self._zi_fir[k])
+                np.square(y, out=y)
+            out[:, :, k] = y.reshape(inner_shape).mean(axis=1)
         out[:, :, b + 1] = np.abs(x).reshape(shape).max(axis=1)
         same = np.empty(x.shape, dtype=np.float32)
         same[0] = x[0] == self._previous

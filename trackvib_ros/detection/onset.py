@@ -41,6 +41,7 @@ class Trigger:
     Attributes:
         floor: energy of the noise, (channels, bands).
         ratio: energy over threshold, the largest of windows and bands, per channel.
+        band: the band of ``ratio``.
         level: energy of the longest window over the floor, the largest of the bands.
         active: ``ratio`` > 1.
         fall_db: by how much the floor has fallen since it was first learned.
@@ -57,6 +58,7 @@ class Trigger:
         self.seen = np.zeros(channels, dtype=np.int64)
         self.fall_db = np.zeros(channels)
         self.level = np.ones(channels)
+        self.band = np.zeros(channels, dtype=np.int64)
         self._history = np.zeros((WINDOWS[-1], *shape))
         self._filled = np.zeros(channels, dtype=np.int64)
         self._warm = np.full((_WARM_UP, *shape), np.nan)
@@ -96,17 +98,20 @@ class Trigger:
             excess = np.zeros(len(ready))
             for w, frames in enumerate(WINDOWS):
                 mean = self._history[:frames].mean(axis=0) / self.floor
-                peak = np.nanmax(mean / self.thresholds[w], axis=1, initial=0.0)
+                relative = np.nan_to_num(mean / self.thresholds[w])
+                band = np.argmax(relative, axis=1)
+                peak = relative[np.arange(len(band)), band]
+                self.band = np.where(peak > excess, band, self.band)
                 np.maximum(excess, peak, out=excess)
             self.level = np.nanmax(mean, axis=1, initial=0.0)
         self.ratio = np.where(usable & ready, excess, 0.0)
         self.active = self.ratio > 1.0
         learn = usable & ready & ~self.active
         if not frozen and learn.any():
-            relative = energy[learn] / self.floor[learn]
+            excess_energy = energy[learn] / self.floor[learn]
             quiet = self._history[:, learn].mean(axis=0) / self.floor[learn]
             weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, 1 / _FLOOR_FRAMES)
-            self.floor[learn] *= 1 + weight * (np.minimum(relative, 4.0) - 1)
+            self.floor[learn] *= 1 + weight * (np.minimum(excess_energy, 4.0) - 1)
             self.fall_db[learn] = np.max(
                 10 * np.log10(self._first_floor[learn] / self.floor[learn]), axis=1
             )
