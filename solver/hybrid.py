@@ -1,0 +1,381 @@
+"""Hybrid FE-SEA run: complex modes below the crossover, statistical energy above it.
+
+Global set: the line's complex modes up to f_g, stepped with a step longer by f_limit/f_g, wheels
+on the irregularity below f_g; the modes above f_g act on the contact by their static compliance.
+Local set: :mod:`solver.local`. Both add up at the rate that was asked for.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from .errors import InputError
+from .irregularity import Profile, build_profile
+from .local import LocalField, LocalWheel, contact_stiffness, local_wheel, low_pass
+from .modal import ModalRun
+from .modes import ModalLine, modal_line
+from .motion import TrainMotion
+from .scenario import Scenario, Train
+from .traffic import Running, Traffic
+from .waves import Real, pinned_pinned_frequency
+
+MARGIN = 1.25
+"""Least crossover per pinned-pinned frequency: that resonance is deterministic."""
+
+LEAST_MARGIN = 1.1
+
+SPEED_RANGE = 2 ** (1 / 6)
+"""Largest ratio of the speeds of a train on the line: a sixth octave."""
+
+HALF_TAPS = 4
+"""Samples of the global set on either side that make a sample in between.
+
+The global set ends at 1.15 f_g, its images start at 1/step - 1.15 f_g; with at least 6 samples
+per period of f_g a Kaiser window of beta 8 leaves -80 dB of them.
+"""
+
+
+def crossover_frequency(scenario: Scenario) -> float:
+    """f_g (Hz): as stated, or the first third-octave edge above 1.25 pinned-pinned frequencies.
+
+    Raises:
+        InputError: the pinned-pinned resonance would be local, or nothing would be.
+    """
+    solution = scenario.solution
+    pinned = pinned_pinned_frequency(scenario.track)
+    chosen = solution.crossover
+    if chosen is None:
+        chosen = 10 ** (math.ceil(10 * math.log10(MARGIN * pinned) - 0.5) / 10 + 0.05)
+    elif chosen < LEAST_MARGIN * pinned:
+        raise InputError(
+            f"solution.crossover = {chosen:g} Hz: must be at least {LEAST_MARGIN * pinned:.0f} Hz, "
+            f"{LEAST_MARGIN} times the pinned-pinned frequency of the rail, {pinned:.0f} Hz: that "
+            "resonance is deterministic and must stay global"
+        )
+    if chosen * 1.12 > solution.frequency_limit:
+        raise InputError(
+            f"solution.crossover = {chosen:.0f} Hz leaves no local band below "
+            f"solution.frequency_limit = {solution.frequency_limit:g} Hz: at least a sixth octave "
+            'is needed; raise frequency_limit, or set solution.model = "fe"'
+        )
+    return float(chosen)
+
+
+class GlobalTraffic(Traffic):
+    """Trains on the irregularity below the crossover."""
+
+    def __init__(self, scenario: Scenario, crossover: float) -> None:
+        self._crossover = crossover
+        self._parts: dict[float, Profile] = {}
+        super().__init__(scenario)
+
+    @property
+    def full_profile(self) -> Profile:
+        """The whole irregularity, from well before to well after the line."""
+        if self._profile is None:
+            self._parts.clear()
+            self._profile = build_profile(
+                self.scenario.irregularity, -self._reach, self.length + self._reach, self.length
+            )
+        return self._profile
+
+    def speed(self, train: int) -> float:
+        """Speed (m/s) of a train on the line.
+
+        Raises:
+            InputError: it changes too much there.
+        """
+        return line_speed(self.motions[train], self.length)
+
+    def roughness(
+        self,
+        units: list[Running] | tuple[Running, ...],
+        position: Real,
+        time: Real,  # type: ignore[override]
+    ) -> Real:
+        """(n, A) m, as :meth:`Traffic.roughness` but without what is local."""
+        profile = self.full_profile
+        whole = self._profile
+        column = 0
+        values = np.empty_like(position)
+        for running in units:
+            speed = self.speed(running.train)
+            if speed not in self._parts:
+                self._parts[speed] = low_pass(profile, 2 * np.pi * self._crossover / speed)
+            count = len(running.unit.wheelsets)
+            own = slice(column, column + count)
+            self._profile = self._parts[speed]
+            try:
+                values[:, own] = super().roughness([running], position[:, own], time)
+            finally:
+                self._profile = whole
+            column += count
+        return values
+
+
+def line_speed(motion: TrainMotion, length: float) -> float:
+    """Geometric mean of the speeds (m/s) between the first axle's entry and the last one's exit.
+
+    Raises:
+        InputError: the largest is more than a sixth octave above the smallest.
+    """
+    times = np.concatenate((motion.axle_times(0.0), motion.axle_times(length)))
+    speeds = motion.speed(np.linspace(times.min(), times.max(), 200))
+    low, high = float(speeds.min()), float(speeds.max())
+    if high > SPEED_RANGE * low:
+        raise InputError(
+            f"train.speed_profile: from {low:g} to {high:g} m/s on the line; the hybrid's local "
+            f'band takes a ratio of {SPEED_RANGE:.3g} at most: set solution.model = "fe"'
+        )
+    return math.sqrt(low * high)
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolate(coarse: Real, filters: Real, first: int, out: Real) -> None:
+    """out[i] at fine sample first + i; coarse[0] is HALF_TAPS - 1 coarse samples earlier."""
+    ratio, taps = filters.shape
+    for i in range(out.shape[0]):
+        phase = (first + i) % ratio
+        at = (first + i) // ratio - first // ratio
+        for c in range(out.shape[1]):
+            total = 0.0
+            for t in range(taps):
+                total += filters[phase, t] * coarse[at + t, c]
+            if np.isnan(total):
+                # a wheelset that comes or goes: straight between the two neighbours
+                a, b = coarse[at + taps // 2 - 1, c], coarse[at + taps // 2, c]
+                if np.isnan(a):
+                    a = b
+                if np.isnan(b):
+                    b = a
+                total = a + (b - a) * phase / ratio
+            out[i, c] = total
+
+
+@njit(cache=True, error_model="numpy")
+def _add_local(
+    force: Real, position: Real, length: float, start: float, step: float, value: Real, slope: Real
+) -> None:
+    last = value.size - 2
+    for i in range(position.size):
+        x = position[i]
+        if not 0.0 <= x <= length:
+            force[i] = np.nan
+            continue
+        place = (x - start) / step
+        cell = min(max(int(place), 0), last)
+        t = place - cell
+        s = 1.0 - t
+        force[i] += s * s * ((1.0 + 2.0 * t) * value[cell] + t * step * slope[cell]) + t * t * (
+            (3.0 - 2.0 * t) * value[cell + 1] - s * step * slope[cell + 1]
+        )
+
+
+def interpolation_filters(ratio: int) -> Real:
+    """(ratio, 2 HALF_TAPS) weights of the neighbouring samples for every place between two."""
+    place = np.arange(ratio)[:, None] / ratio
+    distance = np.arange(-HALF_TAPS + 1, HALF_TAPS + 1)[None, :] - place
+    window = np.i0(8.0 * np.sqrt(np.maximum(1 - (distance / HALF_TAPS) ** 2, 0))) / np.i0(8.0)
+    filters = np.sinc(distance) * window
+    return np.asarray(filters / filters.sum(axis=1, keepdims=True))
+
+
+class HybridRun:
+    """A hybrid run, with the interface of :class:`ModalRun`.
+
+    Args:
+        scenario: what to run.
+        traffic: its trains at the step asked for.
+        derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+
+    Raises:
+        InputError: see :func:`crossover_frequency`; a wheel flat, or a polygon above the
+            crossover: an impact is not a stationary random force.
+
+    Attributes:
+        crossover: f_g (Hz).
+        ratio: steps of the output per step of the global set.
+        line: modes of the global set.
+        field: the local set.
+    """
+
+    def __init__(self, scenario: Scenario, traffic: Traffic, derivatives: tuple[int, ...]) -> None:
+        self.scenario = scenario
+        self.crossover = crossover_frequency(scenario)
+        solution = scenario.solution
+        self.ratio = max(1, int(solution.frequency_limit / self.crossover + 1e-9))
+        coarse = solution.model_copy(
+            update={
+                "model": "fe",
+                "step": solution.step * self.ratio,
+                "frequency_limit": self.crossover,
+            }
+        )
+        self._coarse_scenario = scenario.model_copy(update={"solution": coarse})
+        for train in scenario.train:
+            self._check(train)
+        self._fine = traffic
+        self._traffic = GlobalTraffic(self._coarse_scenario, self.crossover)
+        self.line: ModalLine = modal_line(self._coarse_scenario)
+        self._run = ModalRun(self.line, self._traffic, derivatives)
+        self.field = LocalField(scenario, self.crossover, derivatives)
+        self._filters = interpolation_filters(self.ratio)
+        self._channels = len(scenario.channel)
+        self._derivatives = derivatives
+        self._coarse_done = 0
+        self._next = 0
+        self._buffer_force = np.zeros((0, traffic.wheelsets))
+        self._buffer_signal = np.zeros((0, len(derivatives) * self._channels))
+        self._local = np.zeros((0, len(derivatives), int(self.field.heard.sum())))
+        self._local_first = 0
+        self._wheels: dict[tuple[float, bool, float, float], LocalWheel] = {}
+        self._columns: list[tuple[float, bool, float, float]] = []
+        self._describe_wheels()
+
+    @property
+    def lost_contacts(self) -> int:
+        """Number of times a wheelset lifted off under the forces of the global set."""
+        return self._run.lost_contacts
+
+    @property
+    def equilibrium_residual(self) -> float:
+        """Of the global set."""
+        return self._run.equilibrium_residual
+
+    @property
+    def channel_band(self) -> Real:
+        """(C,) valid band of every channel (Hz)."""
+        limit = self.scenario.solution.frequency_limit
+        return np.where(self.field.heard, limit, self.line.channel_band)
+
+    def reconsider(self) -> None:
+        """Take over trains that were added to the traffic."""
+        for motion in self._fine.motions[len(self._traffic.motions) :]:
+            self._check(motion.train)
+            self._traffic.add(motion.train, self._run.next_sample)
+        self._describe_wheels()
+        missing = self._fine.wheelsets - self._buffer_force.shape[1]
+        empty = np.full((len(self._buffer_force), missing), np.nan)
+        self._buffer_force = np.concatenate([self._buffer_force, empty], axis=1)
+        self._run.reconsider()
+
+    def _check(self, train: Train) -> None:
+        motion = TrainMotion(train)
+        speed = line_speed(motion, self.scenario.line.length)
+        if train.flat:
+            raise InputError(
+                f"train.flat on wheelset {train.flat[0].wheelset}: the impact of a flat is no "
+                'stationary random force, which the hybrid needs: set solution.model = "fe"'
+            )
+        for polygon in train.polygon:
+            radius = _radii(train)[polygon.wheelset - 1]
+            frequency = polygon.order * speed / (2 * math.pi * radius)
+            if frequency > self.crossover:
+                raise InputError(
+                    f"train.polygon of order {polygon.order} on wheelset {polygon.wheelset}: "
+                    f"{frequency:.0f} Hz lies above the hybrid's crossover {self.crossover:.0f} "
+                    'Hz, where forces are random: set solution.model = "fe", or a higher '
+                    "solution.crossover"
+                )
+
+    def _describe_wheels(self) -> None:
+        """Local force tables: one per speed, direction, wheelset mass and contact stiffness."""
+        profile = self._traffic.full_profile
+        self._columns = []
+        for running in self._traffic.running:
+            motion = self._traffic.motions[running.train]
+            speed = self._traffic.speed(running.train)
+            loads = running.unit.static_loads
+            for axle, index in enumerate(running.unit.wheelsets):
+                stiffness = contact_stiffness(
+                    self.scenario.contact,
+                    float(running.unit.wheel_radius[axle]),
+                    round(float(loads[axle]), 3),
+                )
+                mass = float(running.unit.mass[index, index])
+                key = (speed, motion.sign > 0, mass, stiffness)
+                self._columns.append(key)
+                if key not in self._wheels:
+                    self._wheels[key] = local_wheel(
+                        profile, self.field.waves, self.field.edges, *key, self._traffic.length
+                    )
+
+    @property
+    def next_sample(self) -> int:
+        """First sample that the global set has not computed yet."""
+        return self._run.next_sample * self.ratio
+
+    def advance(self, samples: int) -> tuple[Real, Real, Real, Real]:
+        """The next samples: time (n,), position (n, W), force (n, W), channel outputs (n, O).
+
+        Raises:
+            SolverError: the global set diverged.
+        """
+        sample, self._next = self._next, self._next + samples
+        time = (sample + np.arange(samples)) * self._fine.step
+        position = self._fine.position(time)
+        self._reach(sample // self.ratio, (sample + samples - 1) // self.ratio + HALF_TAPS)
+        force = np.empty((samples, position.shape[1]))
+        signal = np.empty((samples, self._buffer_signal.shape[1]))
+        _interpolate(self._buffer_force, self._filters, sample, force)
+        _interpolate(self._buffer_signal, self._filters, sample, signal)
+        length = self._traffic.length
+        for column, key in enumerate(self._columns):
+            table = self._wheels[key].force
+            _add_local(
+                force[:, column],
+                position[:, column],
+                length,
+                table.start,
+                table.step,
+                table.value,
+                table.slope,
+            )
+        local = self._local_signal(sample, samples)
+        heard = np.flatnonzero(self.field.heard)
+        for d in range(len(self._derivatives)):
+            signal[:, d * self._channels + heard] += local[:, d]
+        return time, position, force, signal
+
+    def _reach(self, first: int, last: int) -> None:
+        """Coarse samples first - HALF_TAPS + 1 ... last in the buffers."""
+        need = last + 1 - self._coarse_done
+        if need > 0:
+            _, _, force, signal = self._run.advance(need)
+            if self._coarse_done == 0:
+                lead = HALF_TAPS - 1
+                self._buffer_force = np.repeat(force[:1], lead, axis=0)
+                self._buffer_signal = np.repeat(signal[:1], lead, axis=0)
+            self._buffer_force = np.concatenate([self._buffer_force, force])
+            self._buffer_signal = np.concatenate([self._buffer_signal, signal])
+            self._coarse_done += need
+        # the buffers end with coarse sample _coarse_done - 1
+        begin = first - HALF_TAPS + 1
+        drop = begin - (self._coarse_done - len(self._buffer_force))
+        self._buffer_force = self._buffer_force[drop:]
+        self._buffer_signal = self._buffer_signal[drop:]
+
+    def _local_signal(self, sample: int, count: int) -> Real:
+        hop, parts = self.field.hop, [self._local]
+        have = self._local_first + len(self._local)
+        while have < sample + count:
+            middle = (have + 0.5 * hop) * self.field.step
+            places = self._traffic.position(np.array([middle]))[0]
+            on_line = np.flatnonzero((places >= 0) & (places <= self._traffic.length))
+            wheels = [self._wheels[self._columns[i]] for i in on_line]
+            parts.append(self.field.next_frame(wheels, places[on_line]))
+            have += hop
+        joined = np.concatenate(parts)
+        out = joined[sample - self._local_first : sample - self._local_first + count]
+        self._local = joined[sample - self._local_first + count :]
+        self._local_first = sample + count
+        return out
+
+
+def _radii(train: Train) -> list[float]:
+    from .vehicle import build_units
+
+    return [float(radius) for unit in build_units(train) for radius in unit.wheel_radius]
