@@ -29,7 +29,7 @@ LAYERS: tuple[Layer, ...] = ("rail", "slab", "support_layer", "bridge")
 # Element sizes, resolution and the frequency up to which a layer follows the rail's limit are
 # chosen by measurement: tests/solver/test_line.py states the errors they leave.
 SLAB_ELEMENT = 4.0
-BAY_EXTRA = 7
+BAY_EXTRA = 6
 SINE_MARGIN = 1.5
 SINE_EXTRA = 4
 LAYER_LIMIT: Mapping[Layer, float] = {"support_layer": 2000.0, "bridge": 700.0}
