@@ -179,8 +179,10 @@ def run_demo(
     """
     try:
         directory.mkdir(parents=True)
-    except FileExistsError:
-        raise InputError(f"{directory} exists: name another directory with -o") from None
+    except OSError as error:
+        raise InputError(
+            f"{directory} cannot be made ({error.strerror}): name another directory with -o"
+        ) from None
     stop = Stop()
     bag, logs = directory / "bag", directory / "log"
     logs.mkdir()
@@ -263,6 +265,6 @@ def _tell(bag: Path, directory: Path, figure: bool, console: Console) -> int:
         report.figure(picture)
         console.print(f"figure: {picture}", highlight=False)
     if not report.detected:
-        console.print("[bold red]a train was not detected")
+        console.print("[bold red]not every train was detected, or there was none")
         return 1
     return 0

@@ -8,7 +8,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
 from solver import InputError
@@ -16,20 +15,9 @@ from trackvib_ros import messages as m
 from trackvib_ros.detection import Channel, TrainEvent
 from trackvib_ros.intake import Intake
 from trackvib_ros.outbox import Outbox
-from trackvib_ros.process import Setting, Stop, declare, main, transition, value
+from trackvib_ros.process import Stop, declare, main, transition, value
 from trackvib_ros.recorder import Recorder
-
-TEXTS = Parameter.Type.STRING_ARRAY
-NUMBERS = Parameter.Type.DOUBLE_ARRAY
-SETTINGS = (
-    Setting("autostart", False, "configure and activate at once", read_only=True),
-    Setting("channel_names", TEXTS, "accelerometers; unset: from topic channels", fixed=True),
-    Setting("channel_positions", NUMBERS, "their x along the track [m]", fixed=True),
-    Setting("channel_layers", TEXTS, "rail, slab, support_layer or bridge; each", fixed=True),
-    Setting("channel_topics", TEXTS, "waveform topic of each", fixed=True),
-    Setting("best_effort", False, "subscribe to best-effort publishers too", fixed=True),
-    Setting("record_directory", "", "record all topics to this new bag; empty: no", fixed=True),
-)
+from trackvib_ros.settings import DETECTOR_SETTINGS
 
 
 class DetectorNode(LifecycleNode):  # type: ignore[misc]
@@ -44,7 +32,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         self._inputs: list[tuple[str, Any]] = []
         self._recorder: Recorder | None = None
         self._outbox = Outbox(self)
-        declare(self, SETTINGS)
+        declare(self, DETECTOR_SETTINGS)
         for topic in (m.DIAGNOSTICS, m.TRAIN_EVENTS, m.TRAIN_OCCUPIED, m.TRAIN_SPEED):
             self._outbox.open(topic)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))

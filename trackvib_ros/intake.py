@@ -14,28 +14,34 @@ from trackvib_ros.messages import read_waveform
 from trackvib_ros.waveform import Waveform
 
 RESTART_BLOCKS = 3
-"""So many blocks in sequence, all in the past, mean that the source has started anew."""
+"""So many blocks in sequence, all off the time so far, mean that the source has started anew."""
+
+JUMP_NS = 60_000_000_000
+"""A longer step of the stamps is no gap: a damaged stamp, or the source has started anew (ns)."""
+
+JOIN_NS = 1_000_000_000
+"""After a restart, other topics this close in time belong to the same run (ns)."""
 
 LARGEST = 1e6
 """Magnitude from which a sample is no acceleration of a track but damage (m/s²)."""
 
 
 class _Source:
-    """One topic: where its time stands, and late blocks that may turn out to be a restart."""
+    """One topic: where its time stands, and odd blocks that may turn out to be a restart."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self.names = {channel.name for channel in channels}
         self.frame: str | None = None
         self.next_ns: int | None = None
         self.run = 0
-        self.late: list[Waveform] = []
+        self.held: list[Waveform] = []
 
 
 class Intake:
     """Feeds a detector from waveform messages of several topics, whatever they contain.
 
-    A gap is passed on (the detector counts it as dropped samples); a block of the past is dropped,
-    unless it begins a restart: then the detector finishes and forgets.
+    A gap is passed on (the detector counts it as dropped samples); a block of another time is
+    dropped, unless it begins a restart: then the detector finishes and forgets.
 
     Args:
         channels: the accelerometers by topic.
@@ -57,6 +63,7 @@ class Intake:
         self.gaps: Counter[str] = Counter()
         self.missing_ns: Counter[str] = Counter()
         self.restarts = 0
+        self._now_ns = 0
         self._sources = {topic: _Source(group) for topic, group in channels.items()}
 
     def take(self, topic: str, message: Any) -> list[TrainEvent]:
@@ -100,37 +107,46 @@ class Intake:
         return "; ".join(warnings) or None, figures
 
     def _accept(self, topic: str, source: _Source, block: Waveform) -> list[TrainEvent]:
-        if source.next_ns is None or block.stamp_ns >= source.next_ns:
-            for late in source.late:
-                self._refuse(topic, "in the past", f"stamp {late.stamp_ns} ns is in the past")
-            source.late = []
+        odd = _oddity(source.next_ns, block)
+        if odd is None:
+            self._give_up_held(topic, source)
             return self._process(topic, source, block)
-        if source.late and block.stamp_ns != source.late[-1].end_ns:
-            self._refuse(topic, "in the past", f"stamp {source.late[0].stamp_ns} ns is in the past")
-            source.late = []
-        source.late.append(block)
-        if len(source.late) < RESTART_BLOCKS:
+        if source.held and abs(block.stamp_ns - source.held[-1].end_ns) > block.dt_ns:
+            self._give_up_held(topic, source)
+        source.held.append(block)
+        if len(source.held) < RESTART_BLOCKS:
             return []
-        held, source.late, source.next_ns = source.late, [], None
+        held, source.held, source.next_ns = source.held, [], None
         source.run += 1
         events: list[TrainEvent] = []
         if source.run > self.restarts:
             self.restarts = source.run
             events += self.detector.finish()
             self.detector.reset()
-        for late in held:
-            events += self._process(topic, source, late)
+        source.run = self.restarts
+        for block in held:
+            events += self._process(topic, source, block)
         return events
+
+    def _give_up_held(self, topic: str, source: _Source) -> None:
+        for block in source.held:
+            odd = _oddity(source.next_ns, block) or "in the past"
+            self._refuse(topic, odd, f"stamp {block.stamp_ns} ns is {odd}")
+        source.held = []
 
     def _process(self, topic: str, source: _Source, block: Waveform) -> list[TrainEvent]:
         if source.run < self.restarts and source.next_ns is not None:
-            return []  # remainder of the run before the restart
-        if source.next_ns is not None and block.stamp_ns > source.next_ns:
+            if abs(block.stamp_ns - self._now_ns) > JOIN_NS:
+                source.next_ns = block.end_ns
+                self._refuse(topic, "of an earlier run", f"stamp {block.stamp_ns} ns is stale")
+                return []
+            source.run = self.restarts
+        if source.next_ns is not None and block.stamp_ns > source.next_ns + block.dt_ns // 2:
             self.gaps[topic] += 1
             self.missing_ns[topic] += block.stamp_ns - source.next_ns
         events = self.detector.process(block)
         source.next_ns, source.frame = block.end_ns, block.frame_id
-        source.run = max(source.run, self.restarts)
+        source.run, self._now_ns = self.restarts, block.end_ns
         self.blocks[topic] += 1
         return events
 
@@ -143,6 +159,13 @@ class _Refusal(Exception):
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)
         self.kind = kind
+
+
+def _oddity(next_ns: int | None, block: Waveform) -> str | None:
+    """What is wrong with the time of a block after samples up to ``next_ns``; None if nothing."""
+    if next_ns is None or 0 < block.end_ns - next_ns <= JUMP_NS:
+        return None
+    return "in the past" if block.end_ns <= next_ns else "far in the future"
 
 
 def _cleaned(block: Waveform) -> Waveform:

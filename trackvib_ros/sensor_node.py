@@ -14,7 +14,6 @@ from solver import InputError, Scenario, SolverError, load_scenario
 from trackvib_ros import messages as m
 from trackvib_ros.process import (
     Interrupted,
-    Setting,
     Stop,
     declare,
     in_background,
@@ -23,24 +22,8 @@ from trackvib_ros.process import (
     value,
 )
 from trackvib_ros.run import Component, Run
+from trackvib_ros.settings import SENSOR_SETTINGS
 from trackvib_ros.station import Station, reseeded
-
-DAY = 86400.0
-SETTINGS = (
-    Setting("autostart", False, "configure and activate at once", read_only=True),
-    Setting("exit_at_end", False, "end the process when the run is over", read_only=True),
-    Setting("scenario", "demo", "scenario preset or TOML file", fixed=True),
-    Setting("seed", -1, "seed of the next run, -1 is the scenario's", -1, 2**31 - 1),
-    Setting("real_time_factor", 1.0, "simulated s per s; 0: all haste, no loss [-]", 0.0, 1000.0),
-    Setting("ground_truth", True, "publish ground_truth/...", fixed=True),
-    Setting("await_detectors", 0, "detectors to wait for at the start", 0, 100, fixed=True),
-    Setting("await_recorders", 0, "subscribers of all data to wait for", 0, 100, fixed=True),
-    Setting("step_duration", 1.0, "simulated time of service step [s]", 0.001, 3600.0),
-    Setting("trigger_train", "", "train preset of trigger_passage; empty: the scenario's first"),
-    Setting("trigger_speed", 0.0, "its speed, 0 is that of the scenario [m/s]", 0.0, 200.0),
-    Setting("headway_mean", 0.0, "endless trains: mean random headway [s]", 0.0, DAY, fixed=True),
-    Setting("headway_least", 60.0, "added to each random headway [s]", 5.0, DAY, fixed=True),
-)
 
 
 class SensorNode(LifecycleNode):  # type: ignore[misc]
@@ -50,10 +33,10 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         super().__init__("sensor", **arguments)
         self.failure: str | None = None
         self._stop = stop
-        self._run: Run | None = None
+        self.run: Run | None = None
         self._active = False
         self._resets = 0
-        declare(self, SETTINGS)
+        declare(self, SENSOR_SETTINGS)
         self.add_post_set_parameters_callback(self._on_parameters)
         self._diagnostics = self.create_publisher(
             m.DIAGNOSTICS.type, m.DIAGNOSTICS.name, m.DIAGNOSTICS.qos
@@ -96,12 +79,12 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
             )
 
         station = in_background(assemble, self._stop)
-        if self._run is not None:
-            self._run.close()
-        self._run = Run(self, station, value(self, "ground_truth"))
-        self._run.detectors = value(self, "await_detectors")
-        self._run.recorders = value(self, "await_recorders")
-        self._run.pace.factor = value(self, "real_time_factor")
+        if self.run is not None:
+            self.run.close()
+        self.run = Run(self, station, value(self, "ground_truth"))
+        self.run.detectors = value(self, "await_detectors")
+        self.run.recorders = value(self, "await_recorders")
+        self.run.pace.factor = value(self, "real_time_factor")
 
     @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -113,17 +96,17 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Pause in simulated time."""
         self._active = False
-        if self._run is not None:
-            self._run.hold()
+        if self.run is not None:
+            self.run.hold()
         return super().on_deactivate(state)
 
     @transition
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Free model and topics."""
         self._active = False
-        if self._run is not None and not self._run.close():
+        if self.run is not None and not self.run.close():
             self.get_logger().warning("a subscriber has not taken everything")
-        self._run = None
+        self.run = None
         return super().on_cleanup(state)
 
     @transition
@@ -136,15 +119,15 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         """True when the process shall end: the run is over and that is wanted, or it failed."""
         if self.failure is not None and value(self, "autostart"):
             return True
-        over = self._run is not None and self._run.finished
+        over = self.run is not None and self.run.finished
         return over and bool(value(self, "exit_at_end"))
 
     def work(self) -> float:
         """Advance the run if it is due; returns the time to wait for callbacks (s)."""
-        if self._run is None or not self._active:
+        if self.run is None or not self._active:
             return 1.0
         try:
-            return self._run.advance()
+            return self.run.advance()
         except SolverError as failure:
             self._give_up(failure)
             self.trigger_deactivate()
@@ -155,30 +138,30 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         self.get_logger().error(str(failure))
 
     def _on_parameters(self, parameters: list[Parameter]) -> None:
-        if self._run is not None:
-            self._run.pace.hold()
-            self._run.pace.factor = value(self, "real_time_factor")
+        if self.run is not None:
+            self.run.pace.hold()
+            self.run.pace.factor = value(self, "real_time_factor")
 
     def _report(self) -> None:
-        if self._run is None:
+        if self.run is None:
             components: list[Component] = [
                 ("simulation", self.failure, {"state": "not configured"})
             ]
         else:
-            components = self._run.components()
-        stamp = 0 if self._run is None else self._run.time_ns
+            components = self.run.components()
+        stamp = 0 if self.run is None else self.run.time_ns
         self._diagnostics.publish(m.diagnostics_message(stamp, self.get_name(), components))
 
     def _show(self) -> None:
-        if self._run is not None and self._active:
-            self._run.show()
+        if self.run is not None and self._active:
+            self.run.show()
 
     def _answer(self, command: Callable[[Run], str]) -> Callable[[Any, Any], Any]:
         def answer(_request: Any, response: Any) -> Any:
             try:
-                if self._run is None or not self._active:
+                if self.run is None or not self._active:
                     raise InputError("the node is not active: configure and activate it first")
-                response.message, response.success = command(self._run), True
+                response.message, response.success = command(self.run), True
             except (InputError, SolverError) as failure:
                 response.message = str(failure)
             except Interrupted:
