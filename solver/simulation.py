@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Output = Literal["displacement", "velocity", "acceleration"]
 OUTPUTS: tuple[Output, ...] = ("displacement", "velocity", "acceleration")
 
-SETTLE_TIME = 2.0
+SETTLE_TIME = 3.0
 """Time (s) that a run of unstated end goes on after the last wheelset has left the line."""
 
 
