@@ -104,6 +104,11 @@ class Simulation:
         return math.floor(end / (self.step_ns * 1e-9) + 1e-9) + 1
 
     @property
+    def states(self) -> int:
+        """Number of modes that are stepped."""
+        return len(self._line.eigenvalues)
+
+    @property
     def train_of_wheelset(self) -> NDArray[np.intp]:
         """(W,) index into ``scenario.train`` of every wheelset."""
         counts = [len(motion.offsets) for motion in self.motions]

@@ -77,6 +77,11 @@ class Case:
     limit: bool = False
     slow: bool = False
 
+    @property
+    def size(self) -> float:
+        """Number of cars or spans, whichever the case sets."""
+        return float(self.cars or self.spans)
+
 
 @dataclass(frozen=True, slots=True)
 class Result:
@@ -130,7 +135,7 @@ def scenario_of(case: Case) -> Scenario:
         line = scenario.line.model_copy(update={"spans": (32.0,) * case.spans})
         scenario = scenario.model_copy(update={"line": line})
     solution = scenario.solution.model_copy(update=dict(case.solution))
-    return Scenario.model_validate({**dict(scenario), "solution": solution})
+    return scenario.model_copy(update={"solution": solution})
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +289,6 @@ def run_cases(cases: Sequence[Case]) -> Iterator[Result]:
 
 
 def growth(results: Sequence[Result], sizes: Sequence[float]) -> float:
-    """Exponent p of the least-squares fit CPU time = c * size^p."""
-    cpu = [result.cpu for result in results]
-    return float(np.polyfit(np.log(sizes), np.log(cpu), 1)[0])
+    """Exponent p of the least-squares fit of CPU time per simulated second = c * size^p."""
+    cost = [result.cpu / result.simulated for result in results]
+    return float(np.polyfit(np.log(sizes), np.log(cost), 1)[0])

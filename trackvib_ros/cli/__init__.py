@@ -30,7 +30,13 @@ app = typer.Typer(
     ),
 )
 
-COMMAND_MODULES = ("solver_commands", "detection_commands", "bag_commands", "ros_commands")
+COMMAND_MODULES = (
+    "solver_commands",
+    "detection_commands",
+    "bag_commands",
+    "ros_commands",
+    "bench_commands",
+)
 
 
 def _version(value: bool) -> None:
