@@ -101,6 +101,9 @@ def bench(
                 f"({at[0]:g} to {at[-1]:g})"
             )
     if output is not None:
-        content = {"results": [asdict(result) for result in results], "exponents": exponents}
+        rows = [
+            {k: None if v != v else v for k, v in asdict(result).items()} for result in results
+        ]
+        content = {"results": rows, "exponents": exponents}
         output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         console.print(f"results: {output}")
