@@ -13,6 +13,8 @@ import json
 import math
 import os
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from importlib import metadata
@@ -22,7 +24,7 @@ import numpy as np
 import platformdirs
 import scipy.linalg
 import scipy.sparse as sp
-import scipy.sparse.linalg
+import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from .beam import Array
@@ -32,7 +34,7 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 7
+FORMAT = 8
 CACHE_BYTES = 2 * 2**30
 
 RESIDUAL_REACH = 3.0
@@ -43,7 +45,13 @@ RESIDUAL_STEP = 0.01
 REAL_MARGIN = 1.2
 KEPT_MARGIN = 1.15
 RESIDUAL_TOLERANCE = 1e-4
-GRID_PHASE = 0.6
+RAIL_SHARE = 1e-3
+CHANNEL_SHARE = 1e-2
+CONTACT_COMPLIANCE = 4e-10
+"""Of the two contacts of a wheelset (m/N), in series with the rail's."""
+GRID_PHASE = 0.8
+SIZE_LIMIT = 9000
+"""Coordinates whose dense eigenproblems still fit 6 GB of memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +207,9 @@ def _orthogonalise_clusters(
 ) -> None:
     """Make vectors of (nearly) equal eigenvalues orthogonal in the bilinear form, in place."""
     close = abs(np.subtract.outer(values, values)) < 1e-7 * abs(values)
-    _, label = scipy.sparse.csgraph.connected_components(sp.csr_array(close), directed=False)
+    _, label = scipy.sparse.csgraph.connected_components(
+        sp.csr_matrix(close.astype(np.int8)), directed=False
+    )
     for group in np.flatnonzero(np.bincount(label) > 1):
         chosen = np.flatnonzero(label == group)
         a, b = shapes[:, chosen], velocity[:, chosen]
@@ -215,7 +225,16 @@ def reduced_modes(structure: Structure, limit: float) -> tuple[Array, Array]:
     static part, the residual response to a unit force on rail and slab at every fastening, is
     added as residual vectors (MacNeal 1971), rotated into frequencies of their own. Without them
     the slab is 1 to 30 % wrong between 500 and 2000 Hz however many modes are kept.
+
+    Raises:
+        SolverError: the line has too many coordinates for a dense eigenproblem.
     """
+    if structure.size > SIZE_LIMIT:
+        raise SolverError(
+            f"line of {structure.length:g} m to {structure.scenario.solution.frequency_limit:g} Hz "
+            f"has {structure.size} coordinates; limit of the modal solution {SIZE_LIMIT}: shorten "
+            "the line or lower solution.frequency_limit"
+        )
     omega, shapes = real_modes(structure)
     count = int(np.searchsorted(omega, 2 * np.pi * limit))
     at = structure.fastenings
@@ -243,7 +262,7 @@ def build_modal_line(structure: Structure) -> ModalLine:
     kept = abs(values) <= 2 * np.pi * KEPT_MARGIN * limit
     values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
     start, step, cells = _grid(structure)
-    edges = start + step * np.arange(cells + 1)
+    edges = np.asarray(start + step * np.arange(cells + 1), np.float64)
     rail = _cubics(structure, real, edges)
     table = np.empty((cells, 4, len(values)), complex)
     for part in range(4):
@@ -256,10 +275,13 @@ def build_modal_line(structure: Structure) -> ModalLine:
             + (probe.velocity_rows @ real) @ vectors * values
             + (probe.acceleration_rows @ real) @ vectors * values**2
         )[0]
+    kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
+    values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
+    table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
     inverse = scipy.linalg.inv(structure.stiffness.toarray(), assume_a="pos", check_finite=False)
     static_weights = weights / -values
 
-    thirds = (edges[:-1, None] + step * np.arange(4) / 3).ravel()
+    thirds = np.asarray((edges[:-1, None] + step * np.arange(4) / 3).ravel(), np.float64)
     residual = np.empty(len(thirds))
     for begin in range(0, len(thirds), 1024):
         x = np.clip(thirds[begin : begin + 1024], 0, structure.length)
@@ -292,6 +314,27 @@ def build_modal_line(structure: Structure) -> ModalLine:
     )
 
 
+def _participating(values: Complex, weights: Array, rail: Array, channels: Array) -> np.ndarray:
+    """Modes that matter for a wheel or for a channel.
+
+    A mode's share is its resonant response ``weight |phi_c| max |phi_rail| / |Re lambda|``. At
+    the wheel it is held against the compliance of a wheel-rail contact, in a channel against the
+    largest share within a third of an octave on both sides. ``rail`` and ``channels``: (K,) and
+    (C, K) magnitudes of the shapes.
+    """
+    frequency = abs(values)
+    order = np.argsort(frequency)
+    low = np.searchsorted(frequency[order], frequency[order] / 1.26)
+    high = np.searchsorted(frequency[order], frequency[order] * 1.26, side="right")
+    resonant = weights * rail / np.maximum(abs(values.real), 1e-12 * frequency)
+    matters = np.asarray(resonant * rail > RAIL_SHARE * CONTACT_COMPLIANCE)
+    for channel in channels:
+        share = (resonant * channel)[order]
+        strongest = np.array([share[a:b].max() for a, b in zip(low, high, strict=True)])
+        matters[order] |= share > CHANNEL_SHARE * strongest
+    return matters
+
+
 def _channel_residual(
     structure: Structure,
     inverse: Array,
@@ -300,7 +343,8 @@ def _channel_residual(
     values: Complex,
 ) -> Array:
     """Answers of the channels to forces near them, to first order in s, less those kept."""
-    reach = RESIDUAL_STEP * np.arange(round(RESIDUAL_REACH / RESIDUAL_STEP) + 1)
+    count = round(RESIDUAL_REACH / RESIDUAL_STEP) + 1
+    reach = np.linspace(0.0, (count - 1) * RESIDUAL_STEP, count)
     result = np.zeros((len(channels), 3, 2, len(reach)))
     weights = np.where(values.imag > 0, 2.0, 1.0)
     for number, channel in enumerate(structure.scenario.channel):
@@ -403,7 +447,7 @@ def _read(path: Path) -> ModalLine | None:
         with np.load(path, allow_pickle=False) as stored:
             values = {field.name: stored[field.name] for field in fields(ModalLine)}
         os.utime(path)
-    except (OSError, KeyError, ValueError, EOFError):
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
         return None
     for name in ("grid_start", "grid_step", "length"):
         values[name] = float(values[name])
