@@ -180,6 +180,7 @@ def complex_modes(omega: Array, damping: Array) -> tuple[Complex, Complex, Array
     n = len(omega)
     state = np.block([[np.zeros((n, n)), np.diag(omega)], [-np.diag(omega), -damping]])
     values, vectors = scipy.linalg.eig(state, overwrite_a=True, check_finite=False)
+    vectors = vectors.astype(complex, copy=False)
     upper = values.imag >= 0
     values, vectors = values[upper], vectors[:, upper]
     worst = float((values.real / np.maximum(abs(values), 1e-300)).max())
