@@ -81,7 +81,7 @@ class ModalTables:
     K is padded with zeros to a multiple of 16; weights are folded into the shapes as square roots.
 
     Attributes:
-        shapes: (cells, 8, K) re and -im of the four cubic coefficients of the rail shapes.
+        shapes: (cells, 8, K) re and im of the four cubic coefficients of the rail shapes.
         decay, drive: (2, K) re and im of E and d.
         compliance: (2, cells, 4) m/N, cubic coefficients: rail displacement at a wheelset per its
             new and its last force, residual compliance in the former.
@@ -136,7 +136,7 @@ def modal_tables(
 
     packed = np.zeros((cells, 8, size), dtype=precision)
     packed[:, 0::2, :modes] = shapes.real
-    packed[:, 1::2, :modes] = -shapes.imag
+    packed[:, 1::2, :modes] = shapes.imag
 
     def split(values: Complex) -> Array:
         out = np.zeros((2, size))
@@ -341,7 +341,7 @@ KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 # Slices, not offsets, in the innermost loops: indices that might be negative are not vectorised.
 @njit(**KERNEL)
 def _shape_at(c0, c1, c2, c3, s, shape, modal):  # type: ignore[no-untyped-def]
-    """Rail shapes at s in a cell, and their sum with the modes; re and im (negated) in a row."""
+    """Rail shapes at s in a cell, re and im in a row, and their scalar product with the modes."""
     total = 0.0
     for k in range(shape.size):
         value = c0[k] + s * (c1[k] + s * (c2[k] + s * c3[k]))
@@ -366,15 +366,11 @@ def _add_one(a, f, load):  # type: ignore[no-untyped-def]
 def _step_modes(  # type: ignore[no-untyped-def]
     decay_re, decay_im, drive_re, drive_im, load_re, load_im, re, im
 ):
-    """y = E y + d p; im and load_im hold the negated imaginary parts."""
+    """y = E y + d p; im holds -im of y, so that a real part is a plain scalar product."""
     for k in range(re.size):
-        x, y = re[k], im[k]
-        re[k] = (
-            decay_re[k] * x + decay_im[k] * y + drive_re[k] * load_re[k] + drive_im[k] * load_im[k]
-        )
-        im[k] = (
-            decay_re[k] * y - decay_im[k] * x + drive_re[k] * load_im[k] - drive_im[k] * load_re[k]
-        )
+        x, y, p, q = re[k], im[k], load_re[k], load_im[k]
+        re[k] = decay_re[k] * x + decay_im[k] * y + drive_re[k] * p - drive_im[k] * q
+        im[k] = decay_re[k] * y - decay_im[k] * x - drive_re[k] * q - drive_im[k] * p
 
 
 @njit(**KERNEL)
