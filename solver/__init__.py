@@ -2,7 +2,7 @@
 
 from .errors import InputError, SolverError
 from .motion import TrainMotion
-from .quality import QualityReport
+from .quality import QualityReport, check_run
 from .scenario import (
     GRAVITY,
     Scenario,
@@ -30,6 +30,7 @@ __all__ = [
     "Train",
     "TrainMotion",
     "build_scenario",
+    "check_run",
     "load_scenario",
     "load_scenario_text",
     "preset_names",
