@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from trackvib_ros.environment import complete
 from trackvib_ros.process import Stop
 
-DEADLINE_S = 60.0
+DEADLINE_S = 40.0
 QUICK = Path(__file__).with_name("quick.toml")
 FIRST_DOMAIN = 11
 
@@ -138,7 +138,9 @@ class Processes:
         for process in self._started:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+            if process.stdout is not None and not process.stdout.closed:
+                output, _ = process.communicate()
+                print(process.args[1:4], process.returncode, output)  # pytest shows it on failure
 
 
 def processes_of_test() -> Iterator[Processes]:

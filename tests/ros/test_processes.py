@@ -1,0 +1,137 @@
+"""Sensor and detector as separate processes: any order of start and end, accidents, neighbours."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from tests.ros.harness import (
+    QUICK,
+    Graph,
+    Processes,
+    ended,
+    graph_of_test,
+    own_domain,
+    processes_of_test,
+)
+from tests.ros.test_nodes import figures, warning
+from trackvib_ros import messages as m
+
+pytestmark = pytest.mark.ros
+processes = pytest.fixture(processes_of_test)
+SCENARIO = str(QUICK)
+
+
+@pytest.fixture
+def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
+    own_domain(monkeypatch, offset=2)
+    yield from graph_of_test()
+
+
+def passages(heard: list[Any]) -> list[Any]:
+    return [e for message in heard for e in m.read_events(message) if e.kind == "passage"]
+
+
+def test_order_of_start_does_not_matter_and_both_end_on_signals(
+    graph: Graph, processes: Processes
+) -> None:
+    events = graph.listen(m.TRAIN_EVENTS)
+    rail = graph.listen(m.waveform_topic("rail"))
+    diagnostics = graph.listen(m.DIAGNOSTICS)
+    # the sensor comes first and waits for a detector on all waveforms
+    sensor = processes.node("sensor", scenario=SCENARIO, real_time_factor=0.0, await_detectors=1)
+    graph.until(lambda: figures(diagnostics, "sensor: simulation"), "the sensor")
+    assert rail == []
+    detector = processes.node("detector", use_sim_time=True)
+    graph.until(lambda: passages(events), "the passage")
+    # the detector is started anew while the sensor goes on
+    detector.send_signal(signal.SIGTERM)
+    assert ended(detector) == (0, "")
+    detector = processes.node("detector", use_sim_time=True)
+    graph.until(
+        lambda: (
+            "waiting" not in warning(diagnostics, "detector: input")
+            and figures(diagnostics, "detector: input").get("blocks rail/waveform", "0") == "0"
+        ),
+        "the second detector",
+    )
+    assert graph.trigger("sensor/trigger_passage").success
+    graph.until(lambda: len(passages(events)) >= 2, "the second passage")
+    # the sensor is killed without a word: the detector lives on and says so
+    sensor.kill()
+    graph.until(
+        lambda: "no publisher on" in warning(diagnostics, "detector: input"), "the complaint"
+    )
+    detector.send_signal(signal.SIGINT)
+    assert ended(detector) == (0, "")
+
+
+def test_killed_detector_is_missed_by_the_sensor_which_goes_on(
+    graph: Graph, processes: Processes
+) -> None:
+    diagnostics = graph.listen(m.DIAGNOSTICS)
+    sensor = processes.node("sensor", scenario=SCENARIO, real_time_factor=1.0, headway_mean=1.0)
+    detector = processes.node("detector", use_sim_time=True)
+
+    def blocks() -> int:
+        return int(figures(diagnostics, "detector: input").get("blocks rail/waveform", "0"))
+
+    graph.until(lambda: blocks() > 10, "waveforms at the detector")
+    graph.until(
+        lambda: (
+            figures(diagnostics, "sensor: publishing").get("subscriptions rail/waveform") == "1"
+        ),
+        "subscription",
+    )
+    detector.send_signal(signal.SIGKILL)
+    graph.until(
+        lambda: "subscriptions lost on rail/waveform" in warning(diagnostics, "sensor: publishing"),
+        "the sensor's complaint",
+    )
+
+    def time() -> float:
+        return float(figures(diagnostics, "sensor: simulation")["time_s"])
+
+    before = time()
+    graph.until(lambda: time() > before + 0.5, "further simulated time")
+    sensor.send_signal(signal.SIGINT)
+    status, text = ended(sensor)
+    assert status == 0, text
+
+
+def test_namespaces_and_domains_keep_two_sites_apart(
+    graph: Graph, processes: Processes, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(QUICK.read_text(encoding="utf-8").replace("200 km/h", "120 km/h"))
+    foreign = str((int(os.environ["ROS_DOMAIN_ID"]) + 40) % 101)
+    heard: dict[str, list[Any]] = {}
+    for site, scenario in (("north", SCENARIO), ("south", str(other))):
+        for node, settings in (
+            ("sensor", f"-p scenario:={scenario} -p real_time_factor:=0.0 -p await_detectors:=1"),
+            ("detector", "-p use_sim_time:=false"),
+        ):
+            arguments = f"--ros-args -r __ns:=/{site} -p autostart:=true {settings}".split()
+            processes.start("-m", f"trackvib_ros.{node}_node", *arguments)
+        heard[site] = graph.listen(m.TRAIN_EVENTS, f"/{site}/{m.TRAIN_EVENTS.name}")
+    # the same names in another domain must not be heard here
+    processes.start(
+        "-m", "trackvib_ros.sensor_node", "--ros-args", "-r", "__ns:=/foreign",
+        "-p", "autostart:=true", "-p", f"scenario:={SCENARIO}", "-p", "real_time_factor:=0.0",
+        ROS_DOMAIN_ID=foreign,
+    )  # fmt: skip
+    found: Callable[[str], list[Any]] = lambda site: passages(heard[site])  # noqa: E731
+    graph.until(lambda: found("north") and found("south"), "a passage at both sites")
+    speeds = {site: found(site)[0].values["speed"].value * 3.6 for site in heard}
+    # loose: whose train it is matters here, how well it is measured does not
+    assert speeds["north"] == pytest.approx(200, rel=0.1)
+    assert speeds["south"] == pytest.approx(120, rel=0.1)
+    assert len(found("north")) == len(found("south")) == 1
+    assert not any("/foreign/" in name for name, _ in graph.tester.get_topic_names_and_types())
