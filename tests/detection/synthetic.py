@@ -70,7 +70,12 @@ def _band_noise(rng: np.random.Generator, n: int, rate: float, low: float, high:
 
 
 def clean(
-    passage: Passage, channel: Channel, time: Array, rate: float, rng: np.random.Generator, kind: str
+    passage: Passage,
+    channel: Channel,
+    time: Array,
+    rate: float,
+    rng: np.random.Generator,
+    kind: str,
 ) -> Array:
     """Noise-free acceleration of one channel, scaled to about 1 in the passage."""
     out = np.zeros(time.size)
@@ -110,7 +115,9 @@ def _bridge(passage: Passage, channel: Channel, time: Array, rate: float) -> Arr
             x = position - passage.direction * offset - left
             force += np.where((x > 0) & (x < length), np.sin(mode * np.pi * x / length), 0.0)
         w = 2 * np.pi * frequency
-        system = signal.cont2discrete(([1.0, 0, 0], [1.0, 2 * 0.02 * w, w * w]), 1 / rate, "bilinear")
+        system = signal.cont2discrete(
+            ([1.0, 0, 0], [1.0, 2 * 0.02 * w, w * w]), 1 / rate, "bilinear"
+        )
         response = signal.lfilter(system[0].ravel(), system[1], force)
         out += np.sin(mode * np.pi * (channel.x - left) / length) * response
     return out / 4
@@ -161,7 +168,9 @@ def blocks(
         dt = round(1e9 / rate)
         size = max(1, round(length_s * rate))
         for first in range(0, len(data), size):
-            out.append(Waveform(stamp_ns + first * dt, dt, tuple(names), data[first : first + size]))
+            out.append(
+                Waveform(stamp_ns + first * dt, dt, tuple(names), data[first : first + size])
+            )
     return sorted(out, key=lambda block: block.end_ns)
 
 

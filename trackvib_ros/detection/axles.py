@@ -151,9 +151,7 @@ def fit_axles(
     motion = start
     count = places[0].size
     gaps = np.diff(places[0])
-    nearest = np.minimum(
-        np.concatenate([[np.inf], gaps]), np.concatenate([gaps, [np.inf]])
-    )
+    nearest = np.minimum(np.concatenate([[np.inf], gaps]), np.concatenate([gaps, [np.inf]]))
     reach = float(np.clip(0.45 * np.min(nearest, initial=3.0), 0.4, 1.1))
     half = _HALF + 0.6
     classes = _neighbours(places[0])

@@ -202,7 +202,9 @@ def _two_channels(
         motion=motion,
         speed=(
             speed,
-            float(np.hypot(motion.speed_sigma(float(mid)), speed * 2**0.5 * POSITION_SIGMA / distance)),
+            float(
+                np.hypot(motion.speed_sigma(float(mid)), speed * 2**0.5 * POSITION_SIGMA / distance)
+            ),
         ),
         times=first,
         regular=regularity(first, speed),
@@ -240,6 +242,4 @@ def _one_channel(
     epoch = float(times[0])
     covariance = np.diag([0.3**2, sigma**2, 0.6**2])
     motion = Motion(epoch, 0.0, speed, 0.0, covariance)
-    return Blind(
-        (trace.name,), trace.x, motion, (speed, sigma), times, score, 0, 0.0, method
-    )
+    return Blind((trace.name,), trace.x, motion, (speed, sigma), times, score, 0, 0.0, method)

@@ -29,6 +29,7 @@ FRAME = 10
 _BIN_RATE = 1000.0
 _INNER_RATE = 2500.0  # Hz, band filters run at this rate or up to twice it
 _INNER_TOP = 900.0  # Hz
+_RECURSIVE = np.array([1.0, 0.0])  # keeps lfilter from convolving, whose rounding follows the block
 _FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
 _SETTLE_S = 0.05  # bins after a hole that the filters still remember
 _MAX_GAP_S = 5.0  # longer gaps restart the stream
@@ -136,7 +137,8 @@ class GroupStream:
         self._zi: list[Array] | None = None
         self._last = np.full(n, np.nan)
         self._in_hole = np.zeros(n, dtype=bool)
-        self._unsettled = np.zeros(n, dtype=np.int64)
+        # the filters start on one sample, whose own departure from the mean must fade
+        self._unsettled = np.full(n, int(_SETTLE_S * self.rate))
 
     def push(self, block: Waveform) -> None:
         """Append a block: overlaps are cut, gaps filled with NaN, long gaps restart the grid."""
@@ -173,6 +175,7 @@ class GroupStream:
         self._consume(self._pending_count, flush=True)
         self._pending, self._pending_count = [], 0
         self._zi = None
+        self._unsettled[:] = int(_SETTLE_S * self.rate)
         self.restarts += 1
 
     def advance(self, until_ns: int) -> None:
@@ -265,12 +268,11 @@ class GroupStream:
 
     def _filter(self, x: Array, holes: Array, invalid: NDArray[np.bool_]) -> None:
         n, d = len(x) // self.decimation, self.decimation
-        first = self._zi is None
         if self._zi is None:
             self._zi_front = signal.sosfilt_zi(self._front)[:, :, None] * x[0]
             self._zi = [signal.sosfilt_zi(sos)[:, :, None] * x[0] for sos in self._sos]
             self._zi_fir = [
-                signal.lfilter_zi(fir, 1.0)[:, None] * x[0] if fir.size > 1 else np.empty(0)
+                signal.lfilter_zi(fir, _RECURSIVE)[:, None] * x[0] if fir.size > 1 else np.empty(0)
                 for fir in self._fir
             ]
             self._previous = np.full(x.shape[1], np.nan)
@@ -283,7 +285,7 @@ class GroupStream:
         for k, (sos, fir) in enumerate(zip(self._sos, self._fir, strict=True)):
             y, self._zi[k] = signal.sosfilt(sos, inner, axis=0, zi=self._zi[k])
             if k < b:
-                y, self._zi_fir[k] = signal.lfilter(fir, 1.0, y, axis=0, zi=self._zi_fir[k])
+                y, self._zi_fir[k] = signal.lfilter(fir, _RECURSIVE, y, axis=0, zi=self._zi_fir[k])
                 np.square(y, out=y)
             out[:, :, k] = y.reshape(inner_shape).mean(axis=1)
         out[:, :, b + 1] = np.abs(x).reshape(shape).max(axis=1)
@@ -294,13 +296,7 @@ class GroupStream:
         out[:, :, b + 2] = same.reshape(shape).sum(axis=1)
         out[:, :, b + 3] = ~invalid
         out[:, :, b + 4] = holes
-        if first:
-            # the band filters start on one sample, whose own departure from the mean must fade
-            fade = int(_SETTLE_S / self.step)
-            out[:fade, :, b + 3] = 0
-        stamps = self._pending_ns + self.dt_ns * (
-            np.arange(n, dtype=np.int64) * d + (d - 1) // 2
-        )
+        stamps = self._pending_ns + self.dt_ns * (np.arange(n, dtype=np.int64) * d + (d - 1) // 2)
         self._append(out, stamps)
 
     def _append(self, out: NDArray[np.float32], stamps: NDArray[np.int64]) -> None:

@@ -131,7 +131,9 @@ def regress(
     groups = np.unique(channel)[1:]
     columns = [np.ones_like(t), t, 0.5 * t * t, *((channel == g).astype(float) for g in groups)]
     design = np.stack(columns, axis=1)
-    sigmas = np.array([np.inf, np.inf, prior_acceleration] + [2**0.5 * position_sigma] * len(groups))
+    sigmas = np.array(
+        [np.inf, np.inf, prior_acceleration] + [2**0.5 * position_sigma] * len(groups)
+    )
     weight = np.ones_like(t)
     solution = np.zeros(len(columns))
     scale = least_scale

@@ -68,9 +68,7 @@ class Trigger:
         """Which channels have learned a floor."""
         return self.seen >= _WARM_UP
 
-    def step(
-        self, energy: Array, valid: NDArray[np.bool_], frozen: bool
-    ) -> NDArray[np.bool_]:
+    def step(self, energy: Array, valid: NDArray[np.bool_], frozen: bool) -> NDArray[np.bool_]:
         """Take one frame of energies (channels, bands); say which channels are active.
 
         Invalid frames leave floor and history untouched. ``frozen`` holds the floor.

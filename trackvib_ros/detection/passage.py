@@ -214,9 +214,7 @@ def quiet_gaps(
     if times.size < 2:
         return []
     gaps = np.diff(times)
-    return [
-        (float(times[i]), float(times[i + 1])) for i in np.flatnonzero(gaps > least_s)
-    ]
+    return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(gaps > least_s)]
 
 
 @dataclass(frozen=True)
@@ -238,17 +236,18 @@ def _scan_channel(
     limits: tuple[float, float],
     truncated: bool,
 ) -> _Scanned | None:
-    best: _Scanned | None = None
+    found = []
     for trace, band in zip(traces_of(record, within), record.window.bands, strict=True):
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
         stretch = (0.3, 1.25) if truncated else (0.80, 1.25)
         matches = scan(trace, interval, trains, limits, stretch)
-        found = _Scanned(trace, band, interval, matches)
-        if best is None or found.score > best.score:
-            best = found
-    if best is None or best.score < HOPELESS_SCORE:
+        found.append(_Scanned(trace, band, interval, matches))
+    if not found:
+        return None
+    best = max(found, key=lambda s: s.score)
+    if best.score < HOPELESS_SCORE:
         return best
     return replace(best, matches=refine(best.trace, best.matches, best.interval))
 
@@ -300,9 +299,7 @@ def find_passage(
     interval = reference.interval
     if reference.score < HOPELESS_SCORE:
         traces = tuple(s.trace for s in scanned)
-        passage = Passage(
-            interval, traces, reference.band, (), 0, coarse_score=reference.score
-        )
+        passage = Passage(interval, traces, reference.band, (), 0, coarse_score=reference.score)
     else:
         passage = _fit_hypotheses(usable, reference)
     if passage.known:

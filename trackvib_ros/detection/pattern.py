@@ -163,11 +163,7 @@ def _scan_once(
     chunk = 24
     for first in range(0, speeds.size, chunk):
         part = speeds[first : first + chunk]
-        wanted = [
-            j
-            for j, (low, high) in enumerate(ranges)
-            if low <= part[-1] and high >= part[0]
-        ]
+        wanted = [j for j, (low, high) in enumerate(ranges) if low <= part[-1] and high >= part[0]]
         if not wanted:
             continue
         longest = max(trains[j][0].span for j in wanted)

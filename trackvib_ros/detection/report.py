@@ -273,9 +273,7 @@ def _unknown(
     spacings = blind.spacings
     span = float(spacings.sum())
     duration = float(times[-1] - times[0])
-    acceleration = Estimate(
-        blind.motion.acceleration, blind.motion.acceleration_sigma, "m/s^2"
-    )
+    acceleration = Estimate(blind.motion.acceleration, blind.motion.acceleration_sigma, "m/s^2")
     values: dict[str, Value] = {
         "grade": grade,
         "reference": blind.sensors[0],
