@@ -47,7 +47,7 @@ class Child:
         log: Path,
     ) -> None:
         self.name, self.log = node, log
-        arguments = [sys.executable, "-m", f"trackvib_ros.{node}_node", "--ros-args"]
+        arguments = [sys.executable, "-m", "trackvib_ros.start", node, "--ros-args"]
         for name, setting in parameters.items():
             text = str(setting).lower() if isinstance(setting, bool) else str(setting)
             arguments += ["-p", f"{name}:={text}"]

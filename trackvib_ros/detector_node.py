@@ -15,7 +15,7 @@ from trackvib_ros import messages as m
 from trackvib_ros.detection import Channel, TrainEvent
 from trackvib_ros.intake import Intake
 from trackvib_ros.outbox import Outbox
-from trackvib_ros.process import Stop, declare, main, transition, value
+from trackvib_ros.process import Stop, declare, transition, value
 from trackvib_ros.recorder import Recorder
 from trackvib_ros.settings import DETECTOR_SETTINGS
 
@@ -181,7 +181,3 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             "failure": failure,
             **counts,
         }
-
-
-if __name__ == "__main__":
-    main(DetectorNode)

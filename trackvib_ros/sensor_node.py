@@ -17,7 +17,6 @@ from trackvib_ros.process import (
     Stop,
     declare,
     in_background,
-    main,
     transition,
     value,
 )
@@ -192,7 +191,3 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         seed = scenario.irregularity.seed + 1 if seed < 0 else seed
         self._assemble(reseeded(scenario, seed))
         return f"restarted at 0 s with seed {seed}"
-
-
-if __name__ == "__main__":
-    main(SensorNode)

@@ -128,7 +128,7 @@ class Processes:
         return self.start("-c", code, *arguments, **environment)
 
     def node(self, name: str, **parameters: object) -> subprocess.Popen[str]:
-        arguments = ["-m", f"trackvib_ros.{name}_node", "--ros-args", "-p", "autostart:=true"]
+        arguments = ["-m", "trackvib_ros.start", name, "--ros-args", "-p", "autostart:=true"]
         for key, setting in parameters.items():
             text = str(setting).lower() if isinstance(setting, bool) else str(setting)
             arguments += ["-p", f"{key}:={text}"]

@@ -119,11 +119,11 @@ def test_namespaces_and_domains_keep_two_sites_apart(
             ("detector", "-p use_sim_time:=false"),
         ):
             arguments = f"--ros-args -r __ns:=/{site} -p autostart:=true {settings}".split()
-            processes.start("-m", f"trackvib_ros.{node}_node", *arguments)
+            processes.start("-m", "trackvib_ros.start", node, *arguments)
         heard[site] = graph.listen(m.TRAIN_EVENTS, f"/{site}/{m.TRAIN_EVENTS.name}")
     # the same names in another domain must not be heard here
     processes.start(
-        "-m", "trackvib_ros.sensor_node", "--ros-args", "-r", "__ns:=/foreign",
+        "-m", "trackvib_ros.start", "sensor", "--ros-args", "-r", "__ns:=/foreign",
         "-p", "autostart:=true", "-p", f"scenario:={SCENARIO}", "-p", "real_time_factor:=0.0",
         ROS_DOMAIN_ID=foreign,
     )  # fmt: skip
