@@ -34,11 +34,12 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 8
+FORMAT = 9
 CACHE_BYTES = 2 * 2**30
 
-RESIDUAL_REACH = 3.0
-"""Distance (m) from a channel beyond which dropped modes do not answer a wheel."""
+RESIDUAL_REACH = 8.0
+"""Distance (m) from a channel beyond which dropped modes do not answer a wheel; faded out over
+its second half, because a jump would be an impulse in the velocity."""
 RESIDUAL_STEP = 0.01
 """Grid of the static answer of the dropped modes (m)."""
 
@@ -279,7 +280,7 @@ def build_modal_line(structure: Structure) -> ModalLine:
     kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
     values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
     table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
-    inverse = scipy.linalg.inv(structure.stiffness.toarray(), assume_a="pos", check_finite=False)
+    inverse = _flexibility(structure)
     static_weights = weights / -values
 
     thirds = np.asarray((edges[:-1, None] + step * np.arange(4) / 3).ravel(), np.float64)
@@ -315,6 +316,14 @@ def build_modal_line(structure: Structure) -> ModalLine:
     )
 
 
+def _flexibility(structure: Structure) -> Array:
+    """Inverse of the stiffness, scaled to unit diagonal first: (N, N)."""
+    scale = 1 / np.sqrt(structure.stiffness.diagonal())
+    scaled = structure.stiffness.toarray() * scale[:, None] * scale
+    inverse = scipy.linalg.inv(scaled, assume_a="pos", check_finite=False)
+    return np.asarray(inverse * scale[:, None] * scale)
+
+
 def _participating(values: Complex, weights: Array, rail: Array, channels: Array) -> np.ndarray:
     """Modes that matter for a wheel or for a channel.
 
@@ -348,6 +357,7 @@ def _channel_residual(
     reach = np.linspace(0.0, (count - 1) * RESIDUAL_STEP, count)
     result = np.zeros((len(channels), 3, 2, len(reach)))
     weights = np.where(values.imag > 0, 2.0, 1.0)
+    fade = 0.5 + 0.5 * np.cos(np.pi * np.clip(2 * reach / RESIDUAL_REACH - 1, 0, 1))
     for number, channel in enumerate(structure.scenario.channel):
         place = structure.scenario.channel_x(channel)
         probe = structure.probe(channel)
@@ -363,7 +373,7 @@ def _channel_residual(
             if channel.layer == "rail" and channel.quantity == "motion":
                 missing = structure.missing_rail_deflection(loads[on], place)
                 result[number, 1, side, on] += missing
-    return result
+    return result * fade
 
 
 def _grid(structure: Structure) -> tuple[float, float, int]:
