@@ -15,32 +15,49 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 import scipy.sparse as sp
 import scipy.sparse.linalg
+from numpy.typing import NDArray
 
 from .contact import wheelset_law
 from .irregularity import Profile
 from .scenario import Channel, Contact, Scenario, Track
-from .sea import Chain, PowerBalance, bed_conductance, chain_balance, fastening_conductance
-from .waves import Complex, PeriodicRail, Real, WaveBeam, plate_beam
+from .sea import Chain, PowerBalance, bed_conductance, chain_balance
+from .waves import BlochSolution, Complex, PeriodicRail, Real, WaveBeam, plate_beam
 
-BANDS_PER_OCTAVE = 12
-"""Resolution of the power balance; the rail's decay changes within a third octave."""
+BANDS_PER_OCTAVE = 6
 
-POINTS_PER_BAND = 3
-"""Frequencies per band over which wave properties are averaged."""
+POINTS_PER_BAND = 60
+"""Frequencies per band over which wave properties are averaged: every 10 Hz at 5 kHz."""
+
+DECAY_CLASS = 1.25
+"""Frequencies of a band whose decays differ by more than this factor keep separate balances.
+
+Near the higher pinned-pinned frequencies the rail's decay falls and its motion gathers in
+mid-bay: one mean decay for such a band errs by up to 8 dB at 10 m.
+"""
+
+BAND_MARGIN = 1.15
+"""Highest local frequency per frequency limit: as far as the fe model keeps its modes."""
+
+REFERENCE_DISTANCE = 5.0
+"""Distance (m) at which the mean decay of a band is exact."""
 
 FRAME_TIME = 6.4e-3
 """Time (s) of one step of the power balance, about; the wheel moves half a metre at 300 km/h."""
 
-TAIL = 1e-3
+TAIL = 5e-3
 """Part of the steady response to a wheel's power that may be moved to the last lag."""
 
-MOST_LAGS = 200
+MOST_LAGS = 8
+
+GRID = 0.2
+"""Distance (m) of the points at which the power of a wheel is tabled."""
 
 NEAR_BAYS = 2.5
 """Bays on either side of a wheel where the rail's exact direct field replaces the far field."""
@@ -87,37 +104,143 @@ def _full_size(profile: Profile) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class RailWaves:
-    """The rail's waves in every band, for one state of the fastenings.
+class Cells:
+    """Groups of frequencies that share one power balance.
 
     Attributes:
-        omega: (B, Q) frequencies of the averages (rad/s).
-        receptances: (X, B, Q) driving-point receptances over a bay (m/N).
-        decay: (B,) energy decay (1/m). velocity: (B,) energy velocity (m/s).
-        periodic: the rail on its fastenings.
+        omega: (F,) all frequencies (rad/s), POINTS_PER_BAND in each band.
+        of: (F,) cell of each. band: (N,) band of each cell.
+        centre: (N,) mean frequency of each cell (rad/s).
     """
 
     omega: Real
-    receptances: Complex
-    decay: Real
-    velocity: Real
-    periodic: PeriodicRail
+    of: NDArray[np.intp]
+    band: NDArray[np.intp]
+    centre: Real
 
     @classmethod
-    def of(cls, periodic: PeriodicRail, edges: Real) -> RailWaves:
-        """Waves of a rail in bands of the given edges (Hz)."""
-        inside = (np.arange(POINTS_PER_BAND) + 0.5) / POINTS_PER_BAND
-        omega = 2 * np.pi * edges[:-1, None] * (edges[1:] / edges[:-1])[:, None] ** inside
-        flat = omega.ravel()
-        points = periodic.point_receptances(flat).reshape(-1, *omega.shape)
-        waves = periodic.travelling(flat)
+    def split(cls, edges: Real, decay: Real) -> Cells:
+        """Part every band by decay.
+
+        Args:
+            edges: (B + 1,) Hz. decay: (F,) 1/m at :func:`band_frequencies`.
+        """
+        omega = band_frequencies(edges)
+        cell = np.empty(omega.size, dtype=np.intp)
+        band: list[int] = []
+        for b, part in enumerate(np.split(np.arange(omega.size), len(edges) - 1)):
+            step = np.floor(
+                np.log(decay[part] / np.median(decay[part])) / math.log(DECAY_CLASS) + 0.5
+            )
+            for value in np.unique(step):
+                cell[part[step == value]] = len(band)
+                band.append(b)
+        count = np.bincount(cell)
+        return cls(omega, cell, np.array(band, dtype=np.intp), np.bincount(cell, omega) / count)
+
+    def sum(self, values: Real) -> Real:
+        """Sum over the frequencies of each cell, (..., F) to (..., N)."""
+        out = np.zeros((*values.shape[:-1], len(self.band)))
+        np.add.at(out, (..., self.of), values)
+        return out
+
+    def band_mean(self, values: Real) -> Real:
+        """Mean over the band of each cell, (F,) to (N,)."""
+        return np.asarray(values.reshape(-1, POINTS_PER_BAND).mean(axis=1)[self.band])
+
+
+def band_frequencies(edges: Real) -> Real:
+    """Angular frequencies (rad/s) over which wave properties are averaged, (F,)."""
+    inside = (np.arange(POINTS_PER_BAND) + 0.5) / POINTS_PER_BAND
+    ratio = (edges[1:] / edges[:-1])[:, None]
+    return np.asarray((2 * np.pi * edges[:-1, None] * ratio**inside).ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class RailWaves:
+    """The rail's waves, for one state of the fastenings.
+
+    Means over a cell are those of a wheel's power: weights Re Y/|alpha_r + 1/k_H|^2, so that a
+    sharp resonance between the fastenings counts as it radiates.
+
+    Attributes:
+        solution: Bloch waves at the frequencies of the cells.
+        cells: groups of frequencies.
+        receptances: (X, F) driving-point receptances over a bay (m/N).
+        weights: (F,) of travelling energy, sum 1 in each cell.
+        decay: (N,) energy decay (1/m). velocity: (N,) energy velocity (m/s).
+        to_slab: (N,) part of the power into the rail that its fastenings hand to the slab.
+    """
+
+    solution: BlochSolution
+    cells: Cells
+    receptances: Complex
+    weights: Real
+    decay: Real
+    velocity: Real
+    to_slab: Real
+
+    @classmethod
+    def of(
+        cls,
+        periodic: PeriodicRail,
+        edges: Real,
+        stiffness: float,
+        slab: WaveBeam,
+        cells: Cells | None = None,
+    ) -> RailWaves:
+        """Waves of a rail in bands of the given edges (Hz).
+
+        Args:
+            periodic: the rail.
+            edges: (B + 1,) Hz.
+            stiffness: of the contact of a wheelset (N/m), for the weights.
+            slab: beam below the fastenings.
+            cells: groups of frequencies; unset: made from this rail's decay.
+        """
+        omega = band_frequencies(edges)
+        solution = periodic.solve(omega)
+        waves = solution.travelling()
+        cells = cells or Cells.split(edges, waves.decay)
+        loads = periodic.load_positions(12)
+        points = np.stack([solution.receptance(x, x) for x in loads])
+        radiated = (1j * omega * points).real / np.abs(points + 1 / stiffness) ** 2
+        power = radiated.mean(axis=0)
+        energy = power / waves.energy_velocity
+        weights = energy / cells.sum(energy)[cells.of]
+        left = cells.sum(weights * np.exp(-waves.decay * REFERENCE_DISTANCE))
+        chosen = slice(1, None, 4)
+        share = sum(
+            _slab_share(solution, slab, float(x)) * part
+            for x, part in zip(loads[chosen], radiated[chosen], strict=True)
+        ) / radiated[chosen].sum(axis=0)
         return cls(
-            omega,
+            solution,
+            cells,
             points,
-            waves.decay.reshape(omega.shape).mean(axis=1),
-            waves.energy_velocity.reshape(omega.shape).mean(axis=1),
-            periodic,
+            weights,
+            -np.log(left) / REFERENCE_DISTANCE,
+            cells.sum(power) / cells.sum(energy),
+            cells.sum(power * share) / cells.sum(power),
         )
+
+    @property
+    def periodic(self) -> PeriodicRail:
+        """The rail on its fastenings."""
+        return self.solution.rail
+
+
+def _slab_share(solution: BlochSolution, slab: WaveBeam, load: float) -> Real:
+    """Power of all fastenings into the slab per power of a force on the rail, (F,)."""
+    bays, omega, rail = 25, solution.omega, solution.rail
+    forces = solution.support_receptances(load, bays) * rail.support_stiffness(omega)[:, None]
+    distance = np.arange(2 * bays + 1) * rail.spacing
+    absorbed = (1j * omega[:, None] * slab.transfer_receptance(omega[:, None], distance)).real
+    number = np.arange(2 * bays + 1)
+    between = absorbed[:, np.abs(number[:, None] - number)]
+    taken = np.einsum("fi,fij,fj->f", forces.conj(), between, forces).real
+    given = (1j * omega * solution.receptance(load, load)).real
+    return np.clip(taken / given, 0.0, 0.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +248,9 @@ class LocalWheel:
     """Local force of one wheelset of a train, as a table over its place on the line.
 
     Attributes:
-        force: F(x) (N). square: (B, n) mean square per band (N^2), at ``grid``.
+        force: F(x) (N). square: (N, n) mean square of the cells' bands (N^2), at ``grid``.
         grid: (n,) m.
-        power: (B, n) W, power into the rail per band, <F^2> Re Y.
+        power: (N, n) W, power into the rail per cell, <F^2> Re Y.
     """
 
     force: Profile
@@ -168,10 +291,9 @@ def local_wheel(
     lower = 2 * np.pi * edges[0] / speed
     rest = np.cos(0.5 * np.pi * np.clip((1.03 * lower - k) / (0.06 * lower), 0, 1)) ** 2
     omega = k * speed
-    series = waves.omega.ravel()
-    compliance = waves.receptances.reshape(len(waves.receptances), -1)
-    compliance = compliance + 1 / stiffness - 1 / (mass * series**2)
-    gain = 1 / compliance
+    cells = waves.cells
+    series = cells.omega
+    gain = 1 / (waves.receptances + 1 / stiffness - 1 / (mass * series**2))
     rms = np.sqrt(np.mean(np.abs(gain) ** 2, axis=0))
     mean = gain.mean(axis=0)
     response = -np.interp(omega, series, rms) * np.exp(
@@ -184,13 +306,12 @@ def local_wheel(
     stride = max(1, int(speed / edges[-1] / 8 / profile.step))
     table = _sampled(profile, force, k, stride)
 
-    shape = (len(compliance), *waves.omega.shape)
-    weight = np.abs(gain.reshape(shape)) ** 2
-    absorbed = (1j * waves.omega * waves.receptances).real
-    conductance = (weight * absorbed).mean(axis=(0, 2)) / weight.mean(axis=(0, 2))
+    weight = np.abs(gain) ** 2
+    radiated = (weight * (1j * series * waves.receptances).real).mean(axis=0)
+    conductance = cells.sum(radiated) / POINTS_PER_BAND / cells.band_mean(weight.mean(axis=0))
 
     window = waves.periodic.spacing * 2
-    grid = np.arange(0.0, length + 0.2, 0.2)
+    grid = np.arange(0.0, length + GRID, GRID)
     square = np.empty((len(edges) - 1, len(grid)))
     x = profile.start + profile.step * np.arange(len(profile.value))
     kernel = np.exp(-0.5 * (k * window / 4) ** 2)
@@ -200,7 +321,7 @@ def local_wheel(
         part = np.fft.irfft(np.where(chosen, force, 0), size)
         smooth = np.fft.irfft(np.fft.rfft(part**2) * kernel, size)
         square[band] = np.interp(grid, x, smooth[: len(x)])
-    square = np.maximum(square, 0.0)
+    square = np.maximum(square, 0.0)[cells.band]
     return LocalWheel(table, grid, square, square * conductance[:, None])
 
 
@@ -224,44 +345,52 @@ class LocalField:
         solution = scenario.solution
         self.scenario = scenario
         self.step = solution.step_ns * 1e-9
-        self.edges = band_edges(crossover, solution.frequency_limit)
+        self.edges = band_edges(crossover, BAND_MARGIN * solution.frequency_limit)
         self.hop = max(32, 2 ** round(math.log2(FRAME_TIME / self.step)))
         self.derivatives = derivatives
         self._segment, self.segments = _segments(scenario)
         self._centres = (np.arange(self.segments) + 0.5) * self._segment
         self._states = _fastening_states(scenario, self._centres)
-        self._waves = {
-            state: RailWaves.of(PeriodicRail.of_track(scenario.track, *state), self.edges)
-            for state in sorted(set(self._states))
-        }
         common = max(set(self._states), key=self._states.count)
-        self.waves = self._waves[common]
-        self._decay = np.array([self._waves[state].decay for state in self._states])  # (S, B)
+        self.waves = self._solve(common, None)
+        self._waves = {common: self.waves}
+        for state in sorted(set(self._states) - {common}):
+            self._waves[state] = self._solve(state, self.waves.cells)
+        self._decay = np.array([self._waves[state].decay for state in self._states])  # (S, N)
         self._speed = np.array([self._waves[state].velocity for state in self._states])
         self.heard = np.array([_is_heard(channel) for channel in scenario.channel], dtype=bool)
         channels = [c for c in scenario.channel if _is_heard(c)]
         self._near = [self._near_field(c) for c in channels]
-        self._kernels = self._listen(channels)  # (B, lags, C, 2S)
+        self._kernels = self._listen(channels)  # (lags, 2S, N, C)
         self._scale = np.array([self._factor(c) for c in channels]).reshape(len(channels), -1)
         seeds = np.random.SeedSequence(solution.seed).spawn(len(channels))
         self._random = [np.random.default_rng(seed) for seed in seeds]
-        self._past = np.zeros((self._kernels.shape[1], len(self.edges) - 1, 2 * self.segments))
+        self._past: deque[tuple[NDArray[np.intp], Real]] = deque(maxlen=MOST_LAGS)
         frequency = np.fft.rfftfreq(2 * self.hop, self.step)
-        self._spread = _bin_shares(self.edges, frequency)  # (B, F)
+        self._spread = _bin_shares(self.waves, frequency)  # (N, bins)
         self._omega = 2 * np.pi * np.maximum(frequency, 1.0)
         self._window = np.sin(np.pi * (np.arange(2 * self.hop) + 0.5) / (2 * self.hop))
         self._overlap = np.zeros((self.hop, len(derivatives), len(channels)))
         self._quiet = 0
+
+    def _solve(self, state: tuple[float, float], cells: Cells | None) -> RailWaves:
+        return RailWaves.of(
+            PeriodicRail.of_track(self.scenario.track, *state),
+            self.edges,
+            2 * self.scenario.contact.stiffness,
+            _slab_beam(self.scenario.track),
+            cells,
+        )
 
     @property
     def frame(self) -> float:
         """Time step of the power balance (s)."""
         return self.hop * self.step
 
-    def balance(self, band: int) -> PowerBalance:
-        """The power balance of one band: rail, slab, support layer, either direction."""
-        edges = self.edges
-        omega = 2 * math.pi * math.sqrt(edges[band] * edges[band + 1])
+    def balance(self, cell: int) -> PowerBalance:
+        """The power balance of one cell: rail, slab, support layer, either direction."""
+        band = cell
+        omega = float(self.waves.cells.centre[cell])
         track = self.scenario.track
         mortar = track.mortar
         chains = [Chain(self._speed[:, band], self._decay[:, band], self._segment)]
@@ -276,54 +405,60 @@ class LocalField:
         to_layer = {
             key: bed_conductance(omega, slab, beam, stiffness) for key, beam in layers.items()
         }
-        to_slab = {
-            state: _pad_conductance(omega, waves.periodic, slab)
-            for state, waves in self._waves.items()
-        }
-        links.append(np.array([to_slab[state] for state in self._states]))
-        links.append(np.array([to_layer[bool(key)] for key in on_bridge]))
-        for beams in ([slab] * self.segments, [layers[bool(key)] for key in on_bridge]):
-            distinct = {id(b): _speed_and_decay(b, omega) for b in beams}
-            values = np.array([distinct[id(b)] for b in beams])
-            chains.append(Chain(values[:, 0], values[:, 1], self._segment))
-        # the rail's decay holds what it gives to the slab: pi n-per-length conductance
-        given = math.pi * links[0]
-        chains[0] = replace(chains[0], decay=np.maximum(chains[0].decay - given, 1e-9))
+        # what the rail's decay hands to the slab
+        share = np.array([self._waves[state].to_slab[band] for state in self._states])
+        given = self._decay[:, band] * share
+        chains[0] = replace(chains[0], decay=self._decay[:, band] - given)
+        links.append(given / math.pi)
+        links.append(np.where(on_bridge, to_layer[True], to_layer[False]))
+        speed, decay = _speed_and_decay(slab, omega)
+        chains.append(
+            Chain(np.full(self.segments, speed), np.full(self.segments, decay), self._segment)
+        )
+        values = {key: _speed_and_decay(beam, omega) for key, beam in layers.items()}
+        chains.append(
+            Chain(
+                np.where(on_bridge, values[True][0], values[False][0]),
+                np.where(on_bridge, values[True][1], values[False][1]),
+                self._segment,
+            )
+        )
         return chain_balance(omega, chains, links)
 
     def _listen(self, channels: list[Channel]) -> Real:
         """Mean square velocity at the channels per power into the rail's segments, by lag.
 
-        z' = -A^T z from z(0) = row of the channel; its integrals over the frames are the weights
-        of the powers of past frames.
+        The balance is stepped by implicit Euler, which keeps energies positive and closes
+        (E' - E)/frame = P - A E' exactly; z' = (1 + frame A)^-T z from the channel's row gives
+        the weights of the powers of past frames. Shape (lags, 2S, N, C).
         """
-        bands, size = len(self.edges) - 1, 2 * self.segments
+        cells, size = len(self.waves.decay), 2 * self.segments
+        kernels = np.zeros((MOST_LAGS, size, cells, len(channels)))
         if not channels:
-            return np.zeros((bands, 1, 0, size))
-        found, longest = [], 1
-        for band in range(bands):
-            balance = self.balance(band)
+            return kernels
+        patterns = [self._pattern(c) if c.layer == "rail" else np.ones(cells) for c in channels]
+        for cell in range(cells):
+            balance = self.balance(cell)
             matrix = sp.csc_array(balance.matrix)
-            rows = np.array([self._row(c, band, len(balance.loss)) for c in channels])
-            steady = sp.linalg.splu(matrix).solve(rows.T.copy(), trans="T").T
-            back = sp.csr_array(matrix.T) * -1.0
-            lags, state, left = [], rows.T, steady
-            while len(lags) < MOST_LAGS:
-                state = sp.linalg.expm_multiply(back * self.frame, state)
-                rest = sp.linalg.splu(matrix).solve(state.copy(), trans="T").T
-                lags.append((left - rest)[:, :size])
-                left = rest
-                if np.abs(left[:, :size]).sum() < TAIL * np.abs(steady[:, :size]).sum():
+            rows = np.array([self._row(c, cell, len(balance.loss)) for c in channels])
+            rows *= np.array([pattern[cell] for pattern in patterns])[:, None]
+            left = sp.linalg.splu(matrix).solve(rows.T.copy(), trans="T")
+            enough = TAIL * np.abs(left[:size]).sum()
+            step = sp.linalg.splu(
+                sp.csc_array(sp.eye_array(len(balance.loss)) + matrix * self.frame)
+            )
+            state = rows.T.copy()
+            for lag in range(MOST_LAGS):
+                state = step.solve(state, trans="T")
+                weights = state * self.frame
+                left = left - weights
+                kernels[lag, :, cell] = weights[:size]
+                if np.abs(left[:size]).sum() < enough:
                     break
-            lags[-1] = lags[-1] + left[:, :size]
-            found.append(np.array(lags))
-            longest = max(longest, len(lags))
-        kernels = np.zeros((bands, longest, len(channels), size))
-        for band, lags in enumerate(found):
-            kernels[band, : len(lags)] = lags
+            kernels[lag, :, cell] += left[:size]
         return kernels
 
-    def _row(self, channel: Channel, band: int, size: int) -> Real:
+    def _row(self, channel: Channel, cell: int, size: int) -> Real:
         """Mean square velocity (m^2/s^2) at a channel per energy of every subsystem."""
         row = np.zeros(size)
         layer = {"rail": 0, "slab": 1, "support_layer": 2}[channel.layer]
@@ -340,7 +475,7 @@ class LocalField:
         base = 2 * layer * self.segments
         if layer == 0:
             # each node speaks for the wave that passes it, carried to the channel
-            loss = float(self._decay[j, band]) * self._segment
+            loss = float(self._decay[j, cell]) * self._segment
             right = 0.5 * np.exp([-loss * s, loss * (1 - s)])
             left = 0.5 * np.exp([loss * s, -loss * (1 - s)])
         else:
@@ -348,8 +483,6 @@ class LocalField:
         for direction, share in ((0, right), (1, left)):
             at = base + direction * self.segments + j
             row[at : at + 2] = share / (mass * self._segment)
-        if channel.layer == "rail":
-            row *= self._pattern(channel)[band]
         return row
 
     def _place_in_bay(self, x: float) -> float:
@@ -363,44 +496,46 @@ class LocalField:
         return first + round((x - first) / fastening.spacing) * fastening.spacing
 
     def _pattern(self, channel: Channel) -> Real:
-        """Mean square at the channel's place in the bay relative to the bay's mean, (B,)."""
+        """Mean square at the channel's place in the bay relative to the bay's mean, (N,)."""
         x = self.scenario.channel_x(channel)
         if channel.quantity == "fastening_force":
             x = self._nearest_row(x)
         waves = self.waves
-        field = waves.periodic.travelling(waves.omega.ravel(), [self._place_in_bay(x)])
+        field = waves.solution.travelling([self._place_in_bay(x)])
         chosen = field.strain_pattern if channel.quantity == "strain" else field.pattern
-        return np.asarray(chosen.reshape(waves.omega.shape).mean(axis=1))
+        return waves.cells.sum(chosen[:, 0] * waves.weights)
 
     def _near_field(self, channel: Channel) -> tuple[Real, Real] | None:
         """Exact direct field less the travelling wave, per <F^2> of a wheel near the channel.
 
         Returns:
-            positions (m) of the wheel, mean square velocity per square force there (B, n).
+            positions (m) of the wheel, mean square velocity per square force there (N, n).
         """
         if channel.layer != "rail" or channel.quantity != "motion":
             return None
-        periodic, omega = self.waves.periodic, self.waves.omega
+        waves, periodic = self.waves, self.waves.periodic
+        cells, solution, omega = waves.cells, waves.solution, waves.cells.omega
+        soft = 1 / (2 * self.scenario.contact.stiffness)
         x = self.scenario.channel_x(channel)
         place = self._place_in_bay(x)
         offset = np.arange(-NEAR_BAYS * 8, NEAR_BAYS * 8 + 1) / 8 * periodic.spacing
-        flat = omega.ravel()
-        exact = np.array(
-            [np.abs(flat * periodic.receptance(flat, place + d, place)) ** 2 for d in offset]
-        )
-        absorbed = (1j * omega * self.waves.receptances).real.mean(axis=0)
-        pattern = self._pattern(channel)
-        far = absorbed.mean(axis=1) / (2 * periodic.beam.mass_per_length * self.waves.velocity)
-        far = far * pattern
-        wave = far[:, None] * np.exp(-self.waves.decay[:, None] * np.abs(offset))
-        near = exact.T.reshape(*omega.shape, len(offset)).mean(axis=1) - wave
+        gain = 1 / np.abs(waves.receptances + soft) ** 2
+        mean_gain = cells.band_mean(gain.mean(axis=0)) * POINTS_PER_BAND
+        exact = np.empty((len(cells.band), len(offset)))
+        for i, d in enumerate(offset):
+            at = solution.receptance(place + d, place + d)
+            speed = np.abs(omega * solution.receptance(place + d, place)) ** 2
+            exact[:, i] = cells.sum(speed / np.abs(at + soft) ** 2) / mean_gain
+        power = cells.sum(((1j * omega * waves.receptances).real * gain).mean(axis=0)) / mean_gain
+        far = power / (2 * periodic.beam.mass_per_length * waves.velocity) * self._pattern(channel)
+        near = exact - far[:, None] * np.exp(-waves.decay[:, None] * np.abs(offset))
         # leave the far field smoothly
         fade = np.clip((NEAR_BAYS - np.abs(offset) / periodic.spacing) / 0.5, 0, 1)
         return x + offset, near * fade
 
     def _factor(self, channel: Channel) -> Real:
-        """What a channel shows per velocity at its place, (B,); a spectrum of displacement kind."""
-        omega = 2 * np.pi * np.sqrt(self.edges[:-1] * self.edges[1:])
+        """What a channel shows per velocity at its place, (N,); a spectrum of displacement kind."""
+        omega = self.waves.cells.centre
         track = self.scenario.track
         if channel.quantity == "strain":
             if channel.layer == "rail":
@@ -412,31 +547,30 @@ class LocalField:
             return np.abs(pad)
         return np.ones(len(omega))
 
-    def powers(self, wheels: list[LocalWheel], places: Real) -> Real:
-        """Power into the rail's right and left travelling segments, (B, 2S) W.
+    def powers(self, wheels: list[LocalWheel], places: Real) -> tuple[NDArray[np.intp], Real]:
+        """Power of wheels on the line into the rail's travelling segments.
 
         A wheel feeds the next segment centre on either side with what reaches it; the mean over
         places is the whole power.
+
+        Returns:
+            subsystems (2 wheels,), powers (2 wheels, N) W.
         """
-        bands, count = len(self.edges) - 1, self.segments
-        power = np.zeros((bands, 2 * count))
-        for wheel, x in zip(wheels, places, strict=True):
-            if not 0 <= x <= self.scenario.line.length:
-                continue
-            column = round(x / 0.2)
-            put = wheel.power[:, min(column, len(wheel.grid) - 1)] / 2
+        count = self.segments
+        subsystems = np.empty(2 * len(wheels), dtype=np.intp)
+        power = np.empty((2 * len(wheels), len(self.waves.decay)))
+        for i, (wheel, x) in enumerate(zip(wheels, places, strict=True)):
+            put = wheel.power[:, min(round(x / GRID), len(wheel.grid) - 1)] / 2
             place = x / self._segment - 0.5
             j = math.floor(place)
             loss = self._decay[min(max(j, 0), count - 1)] * self._segment
-            whole = loss / -np.expm1(-loss)
-            right, left = j + 1, count + j
-            if right >= count:  # reflected by the end before it meets a centre
-                right = 2 * count - 1
-            if j < 0:
-                left = 0
-            power[:, right] += put * whole * np.exp(-loss * (j + 1 - place))
-            power[:, left] += put * whole * np.exp(-loss * (place - j))
-        return power
+            whole = put * loss / -np.expm1(-loss)
+            # the ends reflect what would pass them
+            subsystems[2 * i] = j + 1 if j + 1 < count else 2 * count - 1
+            subsystems[2 * i + 1] = count + j if j >= 0 else 0
+            power[2 * i] = whole * np.exp(-loss * (j + 1 - place))
+            power[2 * i + 1] = whole * np.exp(-loss * (place - j))
+        return subsystems, power
 
     def next_frame(self, wheels: list[LocalWheel], places: Real) -> Real:
         """Local channel signals of the next ``hop`` samples, (hop, D, C).
@@ -449,14 +583,15 @@ class LocalField:
             return np.zeros((self.hop, len(self.derivatives), 0))
         if wheels:
             self._quiet = 0
-        elif self._quiet > len(self._past):
+        elif self._quiet > MOST_LAGS:
             out, self._overlap = self._overlap, np.zeros_like(self._overlap)
             return out
         else:
             self._quiet += 1
-        self._past = np.roll(self._past, 1, axis=0)
-        self._past[0] = self.powers(wheels, places)
-        square = np.einsum("blcs,lbs->cb", self._kernels, self._past, optimize=True)
+        self._past.appendleft(self.powers(wheels, places))
+        square = np.zeros((channels, len(self.waves.decay)))
+        for kernel, (subsystems, power) in zip(self._kernels, self._past, strict=False):
+            square += np.einsum("knc,kn->cn", kernel[subsystems], power)
         for c, near in enumerate(self._near):
             if near is None:
                 continue
@@ -464,7 +599,7 @@ class LocalField:
             for wheel, x in zip(wheels, places, strict=True):
                 if positions[0] <= x <= positions[-1]:
                     column = round((x - positions[0]) / (positions[1] - positions[0]))
-                    force = wheel.square[:, min(round(x / 0.2), len(wheel.grid) - 1)]
+                    force = wheel.square[:, min(round(x / GRID), len(wheel.grid) - 1)]
                     square[c] += table[:, column] * force
         square = np.maximum(square, 0.0) * self._scale**2
         # irfft of N bins has the variance 2/N^2 sum <|X|^2>, and <|X|^2> = 2 level^2
@@ -524,20 +659,14 @@ def _slab_beam(track: Track) -> WaveBeam:
     )
 
 
-def _pad_conductance(omega: float, rail: PeriodicRail, slab: WaveBeam) -> float:
-    smeared = replace(rail.beam, support_damping=rail.damping / rail.spacing)
-    pad = complex(rail.stiffness, omega * rail.damping)
-    return fastening_conductance(omega, smeared, slab, 1j * omega / pad, rail.spacing)
-
-
 def _speed_and_decay(beam: WaveBeam, omega: float) -> tuple[float, float]:
     return float(beam.group_velocity(omega)), 2 * float(beam.exponents(omega)[0].real)
 
 
-def _bin_shares(edges: Real, frequency: Real) -> Real:
-    """Share of every band's mean square that falls into every bin of a spectrum, (B, F)."""
-    half = (frequency[1] - frequency[0]) / 2
-    low = np.maximum(edges[:-1, None], frequency - half)
-    high = np.minimum(edges[1:, None], frequency + half)
-    overlap = np.maximum(high - low, 0.0)
-    return np.asarray(overlap / overlap.sum(axis=1, keepdims=True))
+def _bin_shares(waves: RailWaves, frequency: Real) -> Real:
+    """Share of every cell's mean square that falls into every bin of a spectrum, (N, bins)."""
+    cells = waves.cells
+    bins = np.round(cells.omega / (2 * np.pi) / (frequency[1] - frequency[0])).astype(np.intp)
+    shares = np.zeros((len(cells.band), len(frequency)))
+    np.add.at(shares, (cells.of, np.minimum(bins, len(frequency) - 1)), waves.weights)
+    return shares

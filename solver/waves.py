@@ -270,55 +270,17 @@ class PeriodicRail:
             place = support
         return np.asarray(self._carry(omega, x - place) @ total)
 
-    def _bloch(self, omega: Real) -> tuple[Complex, Complex]:
-        """Multipliers (F, 4) and states (F, 4, 4): right travelling, right near, then left."""
-        # Scaling the state keeps the eigenproblem well conditioned.
-        scale = self._scale(omega)
-        period = self._to(omega, self.spacing)
-        period = period * scale[:, None, :] / scale[:, :, None]
-        values, vectors = np.linalg.eig(period)
-        order = np.argsort(-np.abs(values), axis=-1)
-        # |mu|: left near > left travelling > right travelling > right near
-        order = order[:, [2, 3, 1, 0]]
-        values = np.take_along_axis(values, order, axis=-1)
-        vectors = np.take_along_axis(vectors, order[:, None, :], axis=-1)
-        return np.asarray(values), np.asarray(vectors * scale[:, :, None])
-
-    def _scale(self, omega: Real) -> Real:
-        q = np.abs(self.beam.exponents(omega)[:, 0])
-        ei = self.beam.bending_stiffness
-        return np.stack((np.ones_like(q), q, ei * q**3, ei * q**2), axis=-1)
-
-    def _excite(self, omega: Real, load: float) -> tuple[Complex, Complex, Complex]:
-        values, states = self._bloch(omega)
-        scale = self._scale(omega)
-        jump = np.zeros((omega.size, 4, 1), dtype=np.complex128)
-        jump[:, 2, 0] = -1.0
-        to_load = self._to(omega, load)
-        scaled = (to_load @ states) / scale[:, :, None]
-        scaled[:, :, 2:] *= -1
-        solved = np.linalg.solve(scaled, jump / scale[:, :, None])
-        return values, states, np.asarray(solved[:, :, 0])
-
-    def receptance(self, omega: ArrayLike, load: float, place: float) -> Complex:
-        """Displacement at ``place`` per point force at ``load`` (m/N), shape (F,).
-
-        Both in m from the start of one bay, whose support is at spacing / 2.
+    def solve(self, omega: ArrayLike) -> BlochSolution:
+        """The Bloch waves at frequencies (rad/s), ready for many loads and places.
 
         Raises:
             InputError: a frequency that is not positive.
         """
-        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
-        if not np.all(w > 0):
-            raise InputError(f"omega = {w.min():g} rad/s: must be positive")
-        shift = math.floor(load / self.spacing) * self.spacing
-        load, place = load - shift, place - shift
-        bay = math.floor(place / self.spacing)
-        inside = place - bay * self.spacing
-        values, states, amplitudes = self._excite(w, load)
-        side = slice(0, 2) if place >= load else slice(2, 4)
-        travelled = states[:, :, side] * (amplitudes * values**bay)[:, None, side]
-        return np.asarray((self._to(w, inside) @ travelled)[:, 0, :].sum(axis=-1))
+        return BlochSolution(self, np.atleast_1d(np.asarray(omega, dtype=np.float64)))
+
+    def receptance(self, omega: ArrayLike, load: float, place: float) -> Complex:
+        """See :meth:`BlochSolution.receptance`."""
+        return self.solve(omega).receptance(load, place)
 
     def load_positions(self, count: int = 12) -> Real:
         """Equally weighted positions of a load over one bay (m), shape (count,)."""
@@ -326,44 +288,119 @@ class PeriodicRail:
 
     def point_receptances(self, omega: ArrayLike, count: int = 12) -> Complex:
         """Driving-point receptances over one bay (m/N), shape (count, F)."""
-        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
-        return np.stack([self.receptance(w, x, x) for x in self.load_positions(count)])
+        solution = self.solve(omega)
+        return np.stack([solution.receptance(x, x) for x in self.load_positions(count)])
 
     def travelling(self, omega: ArrayLike, places: ArrayLike = ()) -> BlochField:
+        """See :meth:`BlochSolution.travelling`."""
+        return self.solve(omega).travelling(places)
+
+
+class BlochSolution:
+    """Bloch waves of a :class:`PeriodicRail` at given frequencies.
+
+    Args:
+        rail: the rail on its supports.
+        omega: (F,) rad/s, positive.
+    """
+
+    def __init__(self, rail: PeriodicRail, omega: Real) -> None:
+        if not np.all(omega > 0):
+            raise InputError(f"omega = {omega.min():g} rad/s: must be positive")
+        self.rail = rail
+        self.omega = omega
+        q = np.abs(rail.beam.exponents(omega)[:, 0])
+        ei = rail.beam.bending_stiffness
+        # scaling the state keeps the eigenproblem well conditioned
+        self._scale = np.stack((np.ones_like(q), q, ei * q**3, ei * q**2), axis=-1)
+        self._paths: dict[float, Complex] = {}
+        period = self._to(rail.spacing) * self._scale[:, None, :] / self._scale[:, :, None]
+        values, vectors = np.linalg.eig(period)
+        # |mu| falls: left near, left travelling, right travelling, right near
+        order = np.argsort(-np.abs(values), axis=-1)[:, [2, 3, 1, 0]]
+        vectors = np.take_along_axis(vectors, order[:, None, :], axis=-1)
+        self.values = np.take_along_axis(values, order, axis=-1)
+        self.states = vectors * self._scale[:, :, None]
+        self._amplitudes: dict[float, Complex] = {}
+
+    def _to(self, x: float) -> Complex:
+        x = round(x, 9)
+        if x not in self._paths:
+            self._paths[x] = self.rail._to(self.omega, x)
+        return self._paths[x]
+
+    def _excite(self, load: float) -> Complex:
+        """Amplitudes (F, 4) of the four waves for a unit force at ``load`` in the bay."""
+        load = round(load, 9)
+        if load not in self._amplitudes:
+            jump = np.zeros((self.omega.size, 4, 1), dtype=np.complex128)
+            jump[:, 2, 0] = -1.0
+            scaled = (self._to(load) @ self.states) / self._scale[:, :, None]
+            scaled[:, :, 2:] *= -1
+            solved = np.linalg.solve(scaled, jump / self._scale[:, :, None])
+            self._amplitudes[load] = solved[:, :, 0]
+        return self._amplitudes[load]
+
+    def receptance(self, load: float, place: float) -> Complex:
+        """Displacement at ``place`` per point force at ``load`` (m/N), shape (F,).
+
+        Both in m from the start of one bay, whose support is at spacing / 2.
+        """
+        spacing = self.rail.spacing
+        shift = math.floor(load / spacing) * spacing
+        load, place = load - shift, place - shift
+        bay = math.floor(place / spacing)
+        inside = place - bay * spacing
+        side = slice(0, 2) if place >= load else slice(2, 4)
+        weights = (self._excite(load) * self.values**bay)[:, side, None]
+        return np.asarray((self._to(inside)[:, :1] @ self.states[:, :, side] @ weights)[:, 0, 0])
+
+    def support_receptances(self, load: float, bays: int) -> Complex:
+        """Displacement of the rail at the supports of the bays -bays ... bays, (F, 2 bays + 1)."""
+        middle = self.rail.spacing / 2
+        number = np.arange(-bays, bays + 1)
+        shape = (self._to(middle)[:, :1] @ self.states)[:, 0] * self._excite(load)
+        first = 0 if middle >= load else 1
+        out = np.empty((self.omega.size, len(number)), dtype=np.complex128)
+        for right, side in ((True, slice(0, 2)), (False, slice(2, 4))):
+            chosen = number >= first if right else number < first
+            powers = self.values[:, side, None] ** number[chosen]
+            out[:, chosen] = (shape[:, side, None] * powers).sum(axis=1)
+        return out
+
+    def travelling(self, places: ArrayLike = ()) -> BlochField:
         """Decay, energy velocity and bay pattern of the travelling Bloch wave.
 
         Args:
-            omega: rad/s, shape (F,).
             places: positions (m) from the start of a bay, shape (P,).
         """
-        w = np.atleast_1d(np.asarray(omega, dtype=np.float64))
-        x = np.atleast_1d(np.asarray(places, dtype=np.float64)) % self.spacing
-        values, states = self._bloch(w)
-        wave = states[:, :, 0]
-        decay = -2 * np.log(np.abs(values[:, 0])) / self.spacing
+        w, rail = self.omega, self.rail
+        x = np.atleast_1d(np.asarray(places, dtype=np.float64)) % rail.spacing
+        wave = self.states[:, :, 0]
+        decay = -2 * np.log(np.abs(self.values[:, 0])) / rail.spacing
 
         def square(place: float) -> tuple[Real, Real]:
             # Removing the mean decay leaves the periodic part of the wave.
-            state = (self._to(w, place) @ wave[:, :, None])[:, :, 0]
+            state = (self._to(place) @ wave[:, :, None])[:, :, 0]
             gain = np.exp(decay * place)
             speed = np.abs(w * state[:, 0]) ** 2 * gain
-            bending = np.abs(state[:, 3] / self.beam.bending_stiffness) ** 2 * gain
+            bending = np.abs(state[:, 3] / rail.beam.bending_stiffness) ** 2 * gain
             return speed, bending
 
-        samples = [square(place)[0] for place in self.load_positions(24)]
+        samples = [square(place)[0] for place in rail.load_positions(24)]
         mean = np.mean(samples, axis=0)
         velocity = 1j * w[:, None] * wave[:, :2]
         power = -np.real(wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj())
         # The rail itself loses nothing: the power falls in one step at the support in mid-bay.
         # With the smooth decay removed its mean over the bay is the factor sinh(h)/h.
-        h = decay * self.spacing / 2
+        h = decay * rail.spacing / 2
         mean_power = power * np.sinh(h) / h
         patterns = [square(float(place)) for place in x]
         speed = np.stack([p[0] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
         bending = np.stack([p[1] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
         return BlochField(
             decay,
-            mean_power / (self.beam.mass_per_length * mean),
+            mean_power / (rail.beam.mass_per_length * mean),
             speed / mean[:, None],
             bending / mean[:, None],
         )
