@@ -575,6 +575,84 @@ def _march(  # type: ignore[no-untyped-def]
     return lost, worst
 
 
+def march_reference(
+    tables: ModalTables,
+    modal: Array,
+    fleet: Fleet,
+    position: Array,
+    roughness: Array,
+    force: Array,
+    outputs: Array,
+) -> tuple[int, float]:
+    """What :func:`march` does, in a form to be read; a thousand times slower."""
+    size = tables.size
+    decay = tables.decay[0] + 1j * tables.decay[1]
+    drive = tables.drive[0] + 1j * tables.drive[1]
+    lost, worst = 0, 0.0
+
+    def locate(x: float) -> tuple[int, Array]:
+        at = (x - tables.grid_start) / tables.grid_step
+        cell = min(int(at), len(tables.shapes) - 1)
+        return cell, (at - cell) ** np.arange(4)
+
+    for n in range(len(position)):
+        y = modal[:size] - 1j * modal[size:]
+        outputs[n] = tables.channel_weights @ modal
+        load = np.zeros(size, dtype=np.complex128)
+        for u, t in enumerate(fleet.kind):
+            axles = slice(fleet.first[u], fleet.first[u + 1])
+            count = axles.stop - axles.start
+            now, before = fleet.now[t, :count, :count], fleet.before[t, :count, :count]
+            last, x = fleet.force[axles].copy(), position[n, axles]
+            on = (x >= 0) & (x <= tables.length)
+            was_on = (fleet.place[axles] >= 0) & (fleet.place[axles] <= tables.length)
+            new = np.zeros(count)
+            gaps, compliances = np.zeros(count), np.zeros(count)
+            for a in range(count):
+                guess = np.where(np.arange(count) < a, new, last)
+                guess[a] = 0.0
+                gap = fleet.state[u, fleet.wheelsets[t, a]] - roughness[n, axles][a]
+                gap += before[a] @ last + now[a] @ guess
+                own = -now[a, a]
+                if was_on[a]:
+                    cell, powers = locate(fleet.place[axles][a])
+                    outputs[n] += last[a] * (powers @ tables.channel_feed[1, cell])
+                if on[a]:
+                    cell, powers = locate(x[a])
+                    coefficients = tables.shapes[cell].reshape(4, 2, size).astype(np.float64)
+                    shape = powers @ coefficients[:, 0] + 1j * (powers @ coefficients[:, 1])
+                    gap -= (shape * y).real.sum()
+                    own += powers @ tables.compliance[0, cell]
+                    if was_on[a]:
+                        middle, half = locate((x[a] + fleet.place[axles][a]) / 2)
+                        gap -= last[a] * (half @ tables.compliance[1, middle])
+                law = fleet.linear[axles][a], fleet.hertz[axles][a]
+                new[a] = solve_contact(gap, own, *law)
+                gaps[a], compliances[a] = gap, own
+                if on[a]:
+                    load += shape * new[a]
+                    outputs[n] += new[a] * (powers @ tables.channel_feed[0, cell])
+            later = np.triu(now, 1) @ (new - last)
+            for a in range(count):
+                law = fleet.linear[axles][a], fleet.hertz[axles][a]
+                closed = gaps[a] - compliances[a] * new[a] + later[a]
+                worst = max(worst, abs(new[a] - force_of(closed, *law)))
+            states = fleet.states[t]
+            fleet.state[u, :states] = (
+                fleet.transition[t, :states, :states] @ fleet.state[u, :states]
+                + fleet.drive[t, :states, :count] @ new
+                + fleet.constant[t, :states]
+            )
+            away = np.minimum(x, tables.length - x) > END_ZONE
+            lost += int((on & away & fleet.touching[axles] & (new <= 0)).sum())
+            fleet.touching[axles] = np.where(on, new > 0, fleet.touching[axles])
+            fleet.force[axles], fleet.place[axles] = new, x
+            force[n, axles] = np.where(on, new, np.nan)
+        y = decay * y + drive * load
+        modal[:size], modal[size:] = y.real, -y.imag
+    return lost, worst
+
+
 CHUNK = 32
 """Samples per call of the compiled kernel, so that the history of the modes stays in the cache."""
 
@@ -638,6 +716,7 @@ class ModalRun:
         self.tables = modal_tables(
             line, traffic.step, derivatives, order=order, precision=precision
         )
+        traffic.lay_ends(self._static_compliance)
         self.lost_contacts = 0
         self.equilibrium_residual = 0.0
         self._order = order
@@ -652,6 +731,11 @@ class ModalRun:
         self._fleet: Fleet | None = None
         self._steps: list[UnitStep] = []
         self._until = 0
+
+    def _static_compliance(self, place: Array) -> Array:
+        line = self.line
+        kept = (line.weights * (line.rail(place) ** 2 / -line.eigenvalues).real).sum(axis=1)
+        return np.asarray(kept + line.rail_residual(place))
 
     @property
     def next_sample(self) -> int:

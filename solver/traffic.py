@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,10 @@ The mode of a wheelset on its contact spring (167 Hz, 2 % damping for a CRH3) de
 """
 
 NEVER = 2**62
+
+END_ZONE = 4.0
+"""Length (m) of the zone at either end in which the running surface of a crossing wheelset is
+laid so that its loaded level stays even; faded out over its inner half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +72,9 @@ class Traffic:
         self._kinds: list[Unit] = []
         self._profile: Profile | None = None
         self._reach = 0.0
+        self._zone: Array = np.zeros(0)
+        self._rise: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
+        self._crossed: dict[int, tuple[bool, bool]] = {}
         for train in scenario.train:
             self.add(train)
 
@@ -129,6 +136,53 @@ class Traffic:
                     'another train.start, or line.ends = "pinned"'
                 )
 
+    def lay_ends(self, compliance: Callable[[Array], Array]) -> None:
+        """Lower the rigid rail beyond a pinned end to the level that a loaded rail has inside.
+
+        A wheelset that crosses an end would climb its static deflection, about 1 mm, within 1 m:
+        a blow of the size of its weight that no real track gives. Beyond the end the surface is
+        lower by load * c, c the rail's static point compliance inside; within ``END_ZONE`` by
+        what the deflection under the load lacks to that. Wheelsets that do not cross an end
+        during the run never meet this surface.
+
+        Args:
+            compliance: static point compliance of the rail (m/N) at positions (n,) m.
+        """
+        zone = min(END_ZONE, self.length / 4)
+        self._zone = np.linspace(0.0, zone, 161)
+        fade = 0.5 * (1 + np.cos(np.pi * np.clip(2 * self._zone / zone - 1, 0, 1)))
+        sides = []
+        for place in (self._zone, self.length - self._zone):
+            value = compliance(place)
+            value[0] = 0.0
+            sides.append(fade * (value[-1] - value))
+        self._rise = (sides[0], sides[1])
+
+    def _end_surface(self, running: Running, axle: int, position: Array) -> Array | float:
+        """(n,) m: what :meth:`lay_ends` adds under a wheelset at ``position`` (m)."""
+        zone = self._zone[-1]
+        if zone <= position.min() and position.max() <= self.length - zone:
+            return 0.0
+        number = running.columns.start + axle
+        if number not in self._crossed:
+            self._crossed[number] = self._ends_crossed(running, axle)
+        surface = np.zeros_like(position)
+        left, right = self._crossed[number]
+        if left:
+            surface += np.interp(position, self._zone, self._rise[0])
+        if right:
+            surface += np.interp(self.length - position, self._zone, self._rise[1])
+        return surface * float(running.unit.static_loads[axle])
+
+    def _ends_crossed(self, running: Running, axle: int) -> tuple[bool, bool]:
+        motion, end_time = self.motions[running.train], self.scenario.solution.end_time
+        column = running.columns.start - self._first_column(running.train) + axle
+        first = motion.position(np.array([running.start * self.step]))[0, column]
+        last = math.inf * motion.sign
+        if end_time is not None:
+            last = motion.position(np.array([end_time]))[0, column]
+        return min(first, last) < 0, max(first, last) > self.length
+
     @property
     def kinds(self) -> list[Unit]:
         """One unit of every kind."""
@@ -154,7 +208,7 @@ class Traffic:
         return np.concatenate([motion.position(time) for motion in self.motions], axis=1)
 
     def roughness(self, units: Sequence[Running], position: Array, time: Array) -> Array:
-        """(n, A) m: irregularity and wheel defects under the wheelsets of ``units``.
+        """(n, A) m: irregularity, wheel defects and end surfaces under the wheelsets of ``units``.
 
         Args:
             units: A wheelsets in all.
@@ -176,6 +230,8 @@ class Traffic:
                 flats = [flat.length for flat in train.flat if flat.wheelset == number]
                 waves = [wave for wave in train.polygon if wave.wheelset == number]
                 radius = float(running.unit.wheel_radius[axle])
+                if self._zone.size and self.scenario.line.ends == "pinned":
+                    values[:, column] += self._end_surface(running, axle, position[:, column])
                 for length in flats:
                     values[:, column] += wheel_defect(
                         motion.travelled(time), radius, length, 1, 0.0
