@@ -46,10 +46,6 @@ RESIDUAL_STEP = 0.01
 REAL_MARGIN = 1.2
 KEPT_MARGIN = 1.15
 RESIDUAL_TOLERANCE = 1e-4
-RAIL_SHARE = 1e-3
-CHANNEL_SHARE = 1e-2
-CONTACT_COMPLIANCE = 4e-10
-"""Of the two contacts of a wheelset (m/N), in series with the rail's."""
 GRID_PHASE = 0.8
 SIZE_LIMIT = 9000
 """Coordinates whose dense eigenproblems still fit 6 GB of memory."""
@@ -277,9 +273,6 @@ def build_modal_line(structure: Structure) -> ModalLine:
             + (probe.velocity_rows @ real) @ vectors * values
             + (probe.acceleration_rows @ real) @ vectors * values**2
         )[0]
-    kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
-    values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
-    table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
     inverse = _flexibility(structure)
     static_weights = weights / -values
 
@@ -322,27 +315,6 @@ def _flexibility(structure: Structure) -> Array:
     scaled = structure.stiffness.toarray() * scale[:, None] * scale
     inverse = scipy.linalg.inv(scaled, assume_a="pos", check_finite=False)
     return np.asarray(inverse * scale[:, None] * scale)
-
-
-def _participating(values: Complex, weights: Array, rail: Array, channels: Array) -> np.ndarray:
-    """Modes that matter for a wheel or for a channel.
-
-    A mode's share is its resonant response ``weight |phi_c| max |phi_rail| / |Re lambda|``. At
-    the wheel it is held against the compliance of a wheel-rail contact, in a channel against the
-    largest share within a third of an octave on both sides. ``rail`` and ``channels``: (K,) and
-    (C, K) magnitudes of the shapes.
-    """
-    frequency = abs(values)
-    order = np.argsort(frequency)
-    low = np.searchsorted(frequency[order], frequency[order] / 1.26)
-    high = np.searchsorted(frequency[order], frequency[order] * 1.26, side="right")
-    resonant = weights * rail / np.maximum(abs(values.real), 1e-12 * frequency)
-    matters = np.asarray(resonant * rail > RAIL_SHARE * CONTACT_COMPLIANCE)
-    for channel in channels:
-        share = (resonant * channel)[order]
-        strongest = np.array([share[a:b].max() for a, b in zip(low, high, strict=True)])
-        matters[order] |= share > CHANNEL_SHARE * strongest
-    return matters
 
 
 def _channel_residual(

@@ -213,19 +213,6 @@ def test_nothing_off_the_line(line):
     assert not np.any(line.rail(np.array([-0.1, 22.1])))
 
 
-def test_modes_without_participation_are_dropped():
-    # equal damping; mode 1 never moves the rail, mode 2 is seen by the channel alone, mode 3 is
-    # weak in both against its neighbour 4, mode 5 is alone in its band and so its own measure
-    values = np.array([-5 + 100j, -5 + 101j, -5 + 102j, -5 + 103j, -5 + 900j])
-    rail = np.array([0.0, 1e-6, 1e-6, 1e-4, 2e-6])
-    channel = np.array([[1.0, 1e-1, 1e-5, 1e-3, 1e-9]])
-    kept = modes._participating(values, np.full(5, 2.0), rail, channel)
-    np.testing.assert_array_equal(kept, [False, True, False, True, True])
-    # no channel: only what a wheel feels beside its contact, 2 |phi|^2 / 5 > 4e-13 m/N
-    bare = modes._participating(values, np.full(5, 2.0), rail, np.zeros((0, 5)))
-    np.testing.assert_array_equal(bare, [False, False, False, True, True])
-
-
 def test_too_large_a_line_is_refused(structure, monkeypatch):
     monkeypatch.setattr(modes, "SIZE_LIMIT", 100)
     with pytest.raises(SolverError, match=r"has \d+ coordinates; limit of the modal solution 100"):
