@@ -2,8 +2,157 @@
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from solver import InputError, load_scenario_text
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Callable[[int, int, str], None]]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None)
+
+        def step(done: int, total: int, name: str) -> None:
+            bar.update(task, completed=done, total=total, description=f"{title} {Path(name).name}")
+
+        yield step
+
+
+def _new_file(path: Path | None) -> None:
+    if path is not None and path.exists():
+        raise InputError(f"{path} exists: not overwriting it; name another file")
+
+
+def evaluate(
+    bags: Annotated[list[Path], typer.Argument(help="Bags, or directories of bags.")],
+    detector: Annotated[
+        str | None,
+        typer.Option(help="Plug-in as module:factory; the built-in detector if not given."),
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all scores here.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a figure (PNG) here.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes; 0 is one per core.")] = 0,
+) -> None:
+    """Score a detector on recorded bags against their ground truth."""
+    from trackvib_ros.evaluate import evaluate as run
+
+    _new_file(json_file)
+    _new_file(plot)
+    with _progress("evaluating") as step:
+        result = run(bags, detector, workers or os.cpu_count() or 1, step)
+    console = Console()
+    for table in result.tables():
+        console.print(table)
+    for bag in result.bags:
+        if bag.problem:
+            console.print(f"[yellow]{bag.bag}[/yellow]: {bag.problem}")
+    if json_file is not None:
+        json_file.write_text(result.to_json(), "utf-8")
+    if plot is not None:
+        result.figure(plot)
+    if any(bag.problem for bag in result.bags):
+        raise typer.Exit(1)
+
+
+def dataset(
+    spec: Annotated[
+        Path | None, typer.Argument(help="Specification (TOML); see --example.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Directory of the bags.")
+    ] = None,
+    example: Annotated[bool, typer.Option(help="Print an example specification.")] = False,
+    again: Annotated[
+        Path | None,
+        typer.Option(help="Make one bag again from the scenario stored in it; -o names the new."),
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes; 0 is one per core.")] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler (extra [cluster]).")
+    ] = None,
+) -> None:
+    """Make labelled bags: tracks x trains x speeds x noise x faults x seeds. Resumes by itself."""
+    from trackvib_ros import dataset as make
+
+    console = Console()
+    if example:
+        typer.echo(make.EXAMPLE, nl=False)
+        return
+    if output is None:
+        raise InputError("-o is missing: name the directory to make")
+    if again is not None:
+        from trackvib_ros.bag import BagReader
+
+        with BagReader(again) as reader:
+            stored = dict(reader.custom_data)
+        if "scenario" not in stored:
+            raise InputError(f"{again} does not hold its scenario: it cannot be made again")
+        scenario = load_scenario_text(stored["scenario"], str(again))
+        make.write_bag(scenario, output, {k: stored[k] for k in ("case",) if k in stored})
+        console.print(f"[bold]{output}[/bold] made from the scenario in {again}")
+        return
+    if spec is None:
+        raise InputError("the specification is missing: give a TOML file, or see --example")
+    with _progress("making") as step:
+        outcome = make.make_dataset(make.Spec.load(spec), output, workers or None, scheduler, step)
+    counts = {word: sum(o == word for o in outcome.values()) for word in ("made", "there")}
+    failed = {name: o for name, o in outcome.items() if o.startswith("failed")}
+    console.print(
+        f"[bold]{output}[/bold]: {counts['made']} bags made, {counts['there']} were there"
+    )
+    for name, reason in failed.items():
+        console.print(f"[red]{name}[/red] {reason}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def catalogue(
+    file: Annotated[
+        Path | None, typer.Argument(help="Your own catalogue; the shipped one if not given.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Axle positions as JSON.")] = False,
+) -> None:
+    """Check and list a catalogue of train types."""
+    from rich.table import Table
+
+    from trackvib_ros.detection import Catalogue
+
+    known = Catalogue.load(file) if file is not None else Catalogue.default()
+    if as_json:
+        typer.echo(json.dumps({t.name: t.axle_positions for t in known}, indent=1))
+        return
+    table = Table(title=f"catalogue {known.version}", title_style="bold")
+    for name in ("train", "cars", "units", "wheelsets", "length (m)", "family"):
+        table.add_column(name, justify="left" if name in ("train", "family") else "right")
+    for train in known:
+        table.add_row(
+            train.name,
+            str(train.cars),
+            str(train.units),
+            str(len(train.axle_positions)),
+            f"{train.length:.2f}",
+            train.family,
+        )
+    Console().print(table)
 
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands to the application."""
+    app.command()(evaluate)
+    app.command()(dataset)
+    app.command()(catalogue)
