@@ -233,7 +233,7 @@ def test_seed_and_channel_decide_the_noise() -> None:
 def test_impossible_sensors_are_refused() -> None:
     with pytest.raises(InputError, match="so close to half the rate"):
         VirtualSensor(spec(bandwidth=999.0), STEP_NS)
-    with pytest.raises(InputError, match="timing_jitter = 0.001 s"):
+    with pytest.raises(InputError, match=r"timing_jitter = 0.001 s"):
         VirtualSensor(spec(timing_jitter=1e-3), STEP_NS)
 
 
