@@ -8,6 +8,7 @@ Local set: :mod:`solver.local`. Both add up at the rate that was asked for.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -74,6 +75,7 @@ class GlobalTraffic(Traffic):
     def __init__(self, scenario: Scenario, crossover: float) -> None:
         self._crossover = crossover
         self._parts: dict[float, Profile] = {}
+        self._speeds: dict[int, float] = {}
         super().__init__(scenario)
 
     @property
@@ -92,14 +94,11 @@ class GlobalTraffic(Traffic):
         Raises:
             InputError: it changes too much there.
         """
-        return line_speed(self.motions[train], self.length)
+        if train not in self._speeds:
+            self._speeds[train] = line_speed(self.motions[train], self.length)
+        return self._speeds[train]
 
-    def roughness(
-        self,
-        units: list[Running] | tuple[Running, ...],
-        position: Real,
-        time: Real,  # type: ignore[override]
-    ) -> Real:
+    def roughness(self, units: Sequence[Running], position: Real, time: Real) -> Real:
         """(n, A) m, as :meth:`Traffic.roughness` but without what is local."""
         profile = self.full_profile
         whole = self._profile
@@ -137,7 +136,7 @@ def line_speed(motion: TrainMotion, length: float) -> float:
     return math.sqrt(low * high)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _interpolate(coarse: Real, filters: Real, first: int, out: Real) -> None:
     """out[i] at fine sample first + i; coarse[0] is HALF_TAPS - 1 coarse samples earlier."""
     ratio, taps = filters.shape
@@ -159,7 +158,7 @@ def _interpolate(coarse: Real, filters: Real, first: int, out: Real) -> None:
             out[i, c] = total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _add_local(
     force: Real, position: Real, length: float, start: float, step: float, value: Real, slope: Real
 ) -> None:
@@ -255,6 +254,15 @@ class HybridRun:
         limit = self.scenario.solution.frequency_limit
         return np.where(self.field.heard, limit, self.line.channel_band)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what limits the result."""
+        return (
+            f"above {self.crossover:.0f} Hz motion is random with the energy of the power balance; "
+            "single samples there are one of many possible outcomes",
+            f"the global set is stepped at {self.ratio} steps of the output",
+        )
+
     def reconsider(self) -> None:
         """Take over trains that were added to the traffic."""
         for motion in self._fine.motions[len(self._traffic.motions) :]:
@@ -319,7 +327,7 @@ class HybridRun:
             SolverError: the global set diverged.
         """
         sample, self._next = self._next, self._next + samples
-        time = (sample + np.arange(samples)) * self._fine.step
+        time: Real = (sample + np.arange(samples, dtype=np.float64)) * self._fine.step
         position = self._fine.position(time)
         self._reach(sample // self.ratio, (sample + samples - 1) // self.ratio + HALF_TAPS)
         force = np.empty((samples, position.shape[1]))

@@ -89,7 +89,8 @@ def _spectrum(profile: Profile) -> tuple[Complex, Real]:
     fade = 0.5 * (1 + np.cos(np.pi * (np.arange(gap) + 0.5) / gap))
     bridge = profile.value[-1] * fade + profile.value[0] * (1 - fade)
     values = np.concatenate((profile.value, bridge))
-    return np.fft.rfft(values), 2 * np.pi * np.fft.rfftfreq(size, profile.step)
+    k = 2 * np.pi * np.fft.rfftfreq(size, profile.step).astype(np.float64)
+    return np.fft.rfft(values), k
 
 
 def _sampled(profile: Profile, spectrum: Complex, k: Real, stride: int) -> Profile:
@@ -139,10 +140,8 @@ class Cells:
         return cls(omega, cell, np.array(band, dtype=np.intp), np.bincount(cell, omega) / count)
 
     def sum(self, values: Real) -> Real:
-        """Sum over the frequencies of each cell, (..., F) to (..., N)."""
-        out = np.zeros((*values.shape[:-1], len(self.band)))
-        np.add.at(out, (..., self.of), values)
-        return out
+        """Sum over the frequencies of each cell, (F,) to (N,)."""
+        return np.bincount(self.of, values, len(self.band)).astype(np.float64)
 
     def band_mean(self, values: Real) -> Real:
         """Mean over the band of each cell, (F,) to (N,)."""
@@ -240,7 +239,7 @@ def _slab_share(solution: BlochSolution, slab: WaveBeam, load: float) -> Real:
     between = absorbed[:, np.abs(number[:, None] - number)]
     taken = np.einsum("fi,fij,fj->f", forces.conj(), between, forces).real
     given = (1j * omega * solution.receptance(load, load)).real
-    return np.clip(taken / given, 0.0, 0.9)
+    return np.asarray(np.clip(taken / given, 0.0, 0.9))
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +263,7 @@ def contact_stiffness(contact: Contact, radius: float, load: float) -> float:
     linear, hertz = wheelset_law(contact, radius)
     if hertz == 0:
         return linear
-    return 1.5 * hertz ** (2 / 3) * load ** (1 / 3)
+    return float(1.5 * hertz ** (2 / 3) * load ** (1 / 3))
 
 
 def local_wheel(
@@ -344,12 +343,12 @@ class LocalField:
     def __init__(self, scenario: Scenario, crossover: float, derivatives: tuple[int, ...]) -> None:
         solution = scenario.solution
         self.scenario = scenario
-        self.step = solution.step_ns * 1e-9
+        self.step: float = solution.step_ns * 1e-9
         self.edges = band_edges(crossover, BAND_MARGIN * solution.frequency_limit)
         self.hop = max(32, 2 ** round(math.log2(FRAME_TIME / self.step)))
         self.derivatives = derivatives
         self._segment, self.segments = _segments(scenario)
-        self._centres = (np.arange(self.segments) + 0.5) * self._segment
+        self._centres = ((np.arange(self.segments) + 0.5) * self._segment).astype(np.float64)
         self._states = _fastening_states(scenario, self._centres)
         common = max(set(self._states), key=self._states.count)
         self.waves = self._solve(common, None)
@@ -360,13 +359,14 @@ class LocalField:
         self._speed = np.array([self._waves[state].velocity for state in self._states])
         self.heard = np.array([_is_heard(channel) for channel in scenario.channel], dtype=bool)
         channels = [c for c in scenario.channel if _is_heard(c)]
+        self._mortar: dict[tuple[int, float], float] = {}
         self._near = [self._near_field(c) for c in channels]
         self._kernels = self._listen(channels)  # (lags, 2S, N, C)
         self._scale = np.array([self._factor(c) for c in channels]).reshape(len(channels), -1)
         seeds = np.random.SeedSequence(solution.seed).spawn(len(channels))
         self._random = [np.random.default_rng(seed) for seed in seeds]
         self._past: deque[tuple[NDArray[np.intp], Real]] = deque(maxlen=MOST_LAGS)
-        frequency = np.fft.rfftfreq(2 * self.hop, self.step)
+        frequency = np.fft.rfftfreq(2 * self.hop, self.step).astype(np.float64)
         self._spread = _bin_shares(self.waves, frequency)  # (N, bins)
         self._omega = 2 * np.pi * np.maximum(frequency, 1.0)
         self._window = np.sin(np.pi * (np.arange(2 * self.hop) + 0.5) / (2 * self.hop))
@@ -389,26 +389,24 @@ class LocalField:
 
     def balance(self, cell: int) -> PowerBalance:
         """The power balance of one cell: rail, slab, support layer, either direction."""
-        band = cell
         omega = float(self.waves.cells.centre[cell])
         track = self.scenario.track
         mortar = track.mortar
-        chains = [Chain(self._speed[:, band], self._decay[:, band], self._segment)]
+        chains = [Chain(self._speed[:, cell], self._decay[:, cell], self._segment)]
         links = []
         on_bridge = np.zeros(self.segments, dtype=bool)
         for left, right in self.scenario.line.span_bounds:
             on_bridge |= (self._centres >= left) & (self._centres <= right)
-        slab, layers = _slab_beam(track), {}
-        for bridge, bed in ((True, track.bed_on_bridge), (False, track.bed_on_subgrade)):
-            layers[bridge] = plate_beam(track.support_layer, mortar, bed)
-        stiffness = mortar.width * complex(mortar.stiffness, omega * mortar.damping)
-        to_layer = {
-            key: bed_conductance(omega, slab, beam, stiffness) for key, beam in layers.items()
+        slab = _slab_beam(track)
+        layers = {
+            True: plate_beam(track.support_layer, mortar, track.bed_on_bridge),
+            False: plate_beam(track.support_layer, mortar, track.bed_on_subgrade),
         }
+        to_layer = {key: self._mortar_flow(cell, slab, beam) for key, beam in layers.items()}
         # what the rail's decay hands to the slab
-        share = np.array([self._waves[state].to_slab[band] for state in self._states])
-        given = self._decay[:, band] * share
-        chains[0] = replace(chains[0], decay=self._decay[:, band] - given)
+        share = np.array([self._waves[state].to_slab[cell] for state in self._states])
+        given = self._decay[:, cell] * share
+        chains[0] = replace(chains[0], decay=self._decay[:, cell] - given)
         links.append(given / math.pi)
         links.append(np.where(on_bridge, to_layer[True], to_layer[False]))
         speed, decay = _speed_and_decay(slab, omega)
@@ -425,6 +423,17 @@ class LocalField:
         )
         return chain_balance(omega, chains, links)
 
+    def _mortar_flow(self, cell: int, slab: WaveBeam, layer: WaveBeam) -> float:
+        """Conductance from slab to support layer (1/m), in the middle of the cell's band."""
+        band = int(self.waves.cells.band[cell])
+        key = band, layer.support_stiffness
+        if key not in self._mortar:
+            omega = 2 * math.pi * math.sqrt(self.edges[band] * self.edges[band + 1])
+            mortar = self.scenario.track.mortar
+            stiffness = mortar.width * complex(mortar.stiffness, omega * mortar.damping)
+            self._mortar[key] = bed_conductance(omega, slab, layer, stiffness)
+        return self._mortar[key]
+
     def _listen(self, channels: list[Channel]) -> Real:
         """Mean square velocity at the channels per power into the rail's segments, by lag.
 
@@ -439,17 +448,16 @@ class LocalField:
         patterns = [self._pattern(c) if c.layer == "rail" else np.ones(cells) for c in channels]
         for cell in range(cells):
             balance = self.balance(cell)
-            matrix = sp.csc_array(balance.matrix)
+            backward = sp.csc_array(balance.matrix.T)
             rows = np.array([self._row(c, cell, len(balance.loss)) for c in channels])
             rows *= np.array([pattern[cell] for pattern in patterns])[:, None]
-            left = sp.linalg.splu(matrix).solve(rows.T.copy(), trans="T")
+            left = np.asarray(sp.linalg.splu(backward).solve(rows.T.copy()))
             enough = TAIL * np.abs(left[:size]).sum()
-            step = sp.linalg.splu(
-                sp.csc_array(sp.eye_array(len(balance.loss)) + matrix * self.frame)
-            )
+            unit = sp.eye_array(len(balance.loss), format="csc")
+            step = sp.linalg.splu(sp.csc_array(unit + backward * self.frame))
             state = rows.T.copy()
             for lag in range(MOST_LAGS):
-                state = step.solve(state, trans="T")
+                state = np.asarray(step.solve(state))
                 weights = state * self.frame
                 left = left - weights
                 kernels[lag, :, cell] = weights[:size]
@@ -544,7 +552,7 @@ class LocalField:
             return abs(channel.fibre) * plate_beam(plate).wavenumber(omega) ** 2
         if channel.quantity == "fastening_force":
             pad = 2 * track.fastening.stiffness + 2j * omega * track.fastening.damping
-            return np.abs(pad)
+            return np.asarray(np.abs(pad))
         return np.ones(len(omega))
 
     def powers(self, wheels: list[LocalWheel], places: Real) -> tuple[NDArray[np.intp], Real]:

@@ -632,11 +632,11 @@ def march_reference(
                 if on[a]:
                     load += shape * new[a]
                     outputs[n] += new[a] * (powers @ tables.channel_feed[0, cell])
-            later = np.triu(now, 1) @ (new - last)
+            later: Array = np.triu(now, 1) @ (new - last)
             for a in range(count):
                 law = fleet.linear[axles][a], fleet.hertz[axles][a]
                 closed = gaps[a] - compliances[a] * new[a] + later[a]
-                worst = max(worst, abs(new[a] - force_of(closed, *law)))
+                worst = max(worst, abs(float(new[a]) - force_of(float(closed), *law)))
             states = fleet.states[t]
             fleet.state[u, :states] = (
                 fleet.transition[t, :states, :states] @ fleet.state[u, :states]
@@ -650,7 +650,7 @@ def march_reference(
             force[n, axles] = np.where(on, new, np.nan)
         y = decay * y + drive * load
         modal[:size], modal[size:] = y.real, -y.imag
-    return lost, worst
+    return lost, float(worst)
 
 
 CHUNK = 32
@@ -736,6 +736,16 @@ class ModalRun:
         line = self.line
         kept = (line.weights * (line.rail(place) ** 2 / -line.eigenvalues).real).sum(axis=1)
         return np.asarray(kept + line.rail_residual(place))
+
+    @property
+    def channel_band(self) -> Array:
+        """(C,) valid band of every channel (Hz)."""
+        return self.line.channel_band
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what limits the result."""
+        return ()
 
     @property
     def next_sample(self) -> int:
@@ -839,11 +849,11 @@ class ModalRun:
         if self._units:
             limit = FORCE_LIMIT * self._loads
             bad = ~(np.nanmax(np.abs(force), axis=0, initial=0.0) <= limit)
-            if self._fleet is not None:
-                bad |= ~np.isfinite(self._fleet.force)
+            assert self._fleet is not None
+            bad |= ~np.isfinite(self._fleet.force)
             if bad.any():
                 axle = int(np.argmax(bad))
-                value = np.nanmax(np.abs(np.append(force[:, axle], -np.inf)))
+                value = np.nanmax(np.abs(np.append(force[:, axle], self._fleet.force[axle])))
                 raise SolverError(
                     f"force of a wheelset = {value:.3g} N before t = {time[-1]:.6g} s; limit "
                     f"{limit[axle]:.3g} N: the run diverged, shorten solution.step"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .hybrid import HybridRun
 from .modal import ModalRun
 from .modes import modal_line
 from .motion import TrainMotion
@@ -86,9 +87,12 @@ class Simulation:
         _check_step(scenario)
         derivatives = tuple(OUTPUTS.index(name) for name in self._outputs)
         tell("modes of the line: computed once, then kept")
-        self._line = modal_line(scenario)
-        tell(f"{len(self._line.eigenvalues)} modes; compiling or loading the stepping kernel")
-        self._run = ModalRun(self._line, self._traffic, derivatives)
+        self._run: ModalRun | HybridRun
+        if scenario.solution.model == "hybrid":
+            self._run = HybridRun(scenario, self._traffic, derivatives)
+        else:
+            self._run = ModalRun(modal_line(scenario), self._traffic, derivatives)
+        tell(f"{self.states} modes; compiling or loading the stepping kernel")
 
     @property
     def motions(self) -> list[TrainMotion]:
@@ -106,7 +110,7 @@ class Simulation:
     @property
     def states(self) -> int:
         """Number of modes that are stepped."""
-        return len(self._line.eigenvalues)
+        return len(self._run.line.eigenvalues)
 
     @property
     def train_of_wheelset(self) -> NDArray[np.intp]:
@@ -122,7 +126,8 @@ class Simulation:
             equilibrium_residual=self._run.equilibrium_residual,
             energy_residual=None,
             lost_contacts=self._run.lost_contacts,
-            valid_band=dict(zip(self.channels, self._line.channel_band.tolist(), strict=True)),
+            valid_band=dict(zip(self.channels, self._run.channel_band.tolist(), strict=True)),
+            notes=self._run.notes,
         )
 
     def advance(self, samples: int) -> Block:
