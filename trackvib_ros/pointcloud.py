@@ -21,6 +21,8 @@ FLOAT32 = 7
 """``sensor_msgs/PointField.FLOAT32``."""
 
 TIME_FIELD = "t"
+MAX_DT_NS = 8_000_000
+"""Longest interval that FLOAT32 times carry to the nanosecond: dt * 2**-24 < 0.5 ns (ns)."""
 _TIME_TOLERANCE = 1e-6
 """Largest deviation of a row from the constant interval (of that interval)."""
 
@@ -55,14 +57,19 @@ def encode(waveform: Waveform) -> tuple[tuple[PointField, ...], int, bytes]:
     """Return ``(fields, point_step, data)``; ``point_step`` is the bytes of one row.
 
     Raises:
-        InputError: the block has fewer than two samples (its interval would be lost), or a channel
-            is called ``t``.
+        InputError: the block has fewer than two samples (its interval would be lost), the interval
+            is too long, or a channel is called ``t``.
     """
     samples, channels = waveform.data.shape
     if samples < 2:
         raise InputError(
             f"waveform block at stamp {waveform.stamp_ns} ns has {samples} sample(s): a block "
             "needs at least 2 to carry its sampling interval; publish longer blocks"
+        )
+    if not 0 < waveform.dt_ns <= MAX_DT_NS:
+        raise InputError(
+            f"waveform block has dt_ns = {waveform.dt_ns} ns: must be greater than 0 and at most "
+            f"{MAX_DT_NS} ns (125 Hz), or its FLOAT32 times do not tell it exactly"
         )
     if channels != len(waveform.channels) or TIME_FIELD in waveform.channels:
         raise InputError(
@@ -86,8 +93,8 @@ def decode(
 ) -> Waveform:
     """Return the block of a table that :func:`encode` or any driver following it has made.
 
-    The interval is the mean of the ``t`` column rounded to whole nanoseconds: its FLOAT32 rounding
-    (at most 2 ns at 50 ms) is divided by the number of intervals.
+    The interval is the mean of the ``t`` column rounded to whole nanoseconds: rounding the last
+    time to FLOAT32 changes it by at most dt * 2**-24.
 
     Raises:
         InputError: field ``t`` is missing, a field is not FLOAT32, fewer than two rows, a broken
@@ -122,7 +129,8 @@ def decode(
         )
     )
     seconds = table[TIME_FIELD].astype(np.float64)
-    dt_ns = round((seconds[-1] - seconds[0]) * 1e9 / (seconds.size - 1))
+    mean_ns = (seconds[-1] - seconds[0]) * 1e9 / (seconds.size - 1)
+    dt_ns = round(mean_ns) if np.isfinite(mean_ns) else 0
     deviation = np.abs(seconds - np.arange(seconds.size) * (dt_ns * 1e-9))
     allowed = max(_TIME_TOLERANCE * dt_ns * 1e-9, 2.0**-23 * abs(seconds[-1]))
     if dt_ns <= 0 or not np.all(deviation <= allowed):

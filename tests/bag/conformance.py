@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import math
@@ -64,13 +65,15 @@ def npm(request: pytest.FixtureRequest) -> NpmReader:
 
 
 def plain(value: Any) -> Any:
-    """A decoded message as JSON knows it, NaN as text."""
+    """A decoded message as JSON knows it, NaN as text, bytes in base 64."""
     if dataclasses.is_dataclass(value):
         return {
             field.name: plain(getattr(value, field.name))
             for field in dataclasses.fields(value)
             if not (field.name.startswith("__") or field.name.isupper())  # constants
         }
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+        return base64.b64encode(value.tobytes()).decode()
     if isinstance(value, np.ndarray):
         return [plain(item) for item in value.tolist()]
     if isinstance(value, list):

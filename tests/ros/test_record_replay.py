@@ -28,7 +28,7 @@ from trackvib_ros.recorder import Recorder
 
 pytestmark = pytest.mark.ros
 
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -53,10 +53,16 @@ def node(domain: int) -> Iterator[Node]:
     rclpy.try_shutdown()
 
 
-def until(condition: Callable[[], Any], what: str, work: Callable[[], Any] | None = None) -> None:
-    end = time.monotonic() + DEADLINE_S
+def until(
+    condition: Callable[[], Any],
+    what: str,
+    work: Callable[[], Any] | None = None,
+    *,
+    deadline_s: float = DEADLINE_S,
+) -> None:
+    end = time.monotonic() + deadline_s
     while not condition():
-        assert time.monotonic() < end, f"{what} did not happen within {DEADLINE_S} s"
+        assert time.monotonic() < end, f"{what} did not happen within {deadline_s} s"
         if work is not None:
             work()
         time.sleep(0.002)

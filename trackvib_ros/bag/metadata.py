@@ -17,6 +17,7 @@ VERSION = 9
 INFINITE_NS = 9223372036854775807
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 _KEY = "rosbag2_bagfile_information"
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def qos_text(profiles: Iterable[Qos]) -> str:
 
 def parse_qos(value: object) -> tuple[Qos, ...]:
     """Read profiles from a YAML text (channels, bags before version 9) or a list."""
-    items = yaml.safe_load(value) if isinstance(value, str) else value
+    items = load(value) if isinstance(value, str) else value
     return tuple(Qos.from_dict(item) for item in items) if isinstance(items, list) else ()
 
 
@@ -163,6 +164,11 @@ def information(
     }
 
 
+def load(text: str) -> Any:
+    """Parse YAML, with libyaml where PyYAML has it: ten times faster."""
+    return yaml.load(text, Loader=_Loader)
+
+
 def as_yaml(content: Mapping[str, Any]) -> str:
     """Return YAML text that yaml-cpp, ruamel and PyYAML read alike."""
     return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=10**6)
@@ -188,7 +194,7 @@ def read(directory: Path) -> dict[str, Any]:
     """
     path = directory / FILE_NAME
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = load(path.read_text(encoding="utf-8"))
         information = content[_KEY]
         if not isinstance(information["relative_file_paths"], list):
             raise TypeError("relative_file_paths is not a list")

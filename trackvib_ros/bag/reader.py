@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -131,7 +130,7 @@ class BagReader:
             return self._metadata
         for file in reversed(self._files):
             text = file.records.get("rosbag2", {}).get("serialized_metadata")
-            content = yaml.safe_load(text) if text else None
+            content = metadata.load(text) if text else None
             if isinstance(content, dict):
                 return content
         return {}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from trackvib_ros.replay import Player
 
 Bag = Annotated[Path, typer.Argument(help="Bag directory or .mcap file.")]
-_MEASURED = ("speed", "length", "axle_count", "train_type", "direction")
+_MEASURED = ("type", "train_type", "axle_count", "direction", "speed", "length")
 
 
 def register(app: typer.Typer) -> None:
