@@ -593,7 +593,7 @@ def march_reference(
     def locate(x: float) -> tuple[int, Array]:
         at = (x - tables.grid_start) / tables.grid_step
         cell = min(int(at), len(tables.shapes) - 1)
-        return cell, (at - cell) ** np.arange(4)
+        return cell, np.asarray((at - cell) ** np.arange(4), np.float64)
 
     for n in range(len(position)):
         y = modal[:size] - 1j * modal[size:]
@@ -736,6 +736,8 @@ class ModalRun:
         line = self.line
         kept = (line.weights * (line.rail(place) ** 2 / -line.eigenvalues).real).sum(axis=1)
         return np.asarray(kept + line.rail_residual(place))
+
+    ratio = 1
 
     @property
     def channel_band(self) -> Array:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
 from .contact import compression_of
-from .errors import SolverError
 from .scenario import GRAVITY, Car, Train, WheelElement
 
 Array = NDArray[np.float64]
@@ -238,8 +237,8 @@ def static_start(
 ) -> tuple[Array, Array]:
     """Static equilibrium of units on the track.
 
-    Solves K y + P^T F = weight together with P y - compliance F - roughness = compression(F) by
-    Newton's method from the loads on a rigid flat track.
+    Every bogie pitches freely on its wheelsets and every body on its bogies, so the wheelset
+    forces are those on a rigid flat track, whatever lies under the wheelsets.
 
     Args:
         unit: one unit, or several as a block.
@@ -248,40 +247,12 @@ def static_start(
         roughness: (A,) m.
 
     Returns:
-        displacements (N,) and wheelset forces (A,).
-
-    Raises:
-        SolverError: some wheelset would not be in contact, or no convergence.
+        displacements (N,) m or rad, and wheelset forces (A,) N.
     """
-    size, axles = len(unit.weight), len(unit.wheelsets)
-    select = np.zeros((axles, size))
-    select[np.arange(axles), unit.wheelsets] = 1.0
     force = unit.static_loads
-    matrix = np.block([[unit.stiffness, select.T], [select, -compliance]])
-    scale = force.max()
-    for _ in range(50):
-        slope = np.where(
-            law[1] > 0,
-            2 / 3 * compression_of(force, *law) / force,
-            compression_of(force, *law) / force,
-        )
-        current = matrix.copy()
-        current[size:, size:] -= np.diag(slope)
-        right = np.concatenate(
-            [unit.weight, roughness + compression_of(force, *law) - slope * force]
-        )
-        solution = np.linalg.solve(current, right)
-        change = solution[size:] - force
-        force = solution[size:]
-        if (force <= 0).any():
-            low = int(np.argmin(force))
-            raise SolverError(
-                f"static start: force of wheelset {low + 1} of the unit = {force[low]:.4g} N; it "
-                "must be positive: the irregularity under it is too large, start elsewhere"
-            )
-        if np.abs(change).max() <= 1e-11 * scale:
-            return solution[:size], force
-    raise SolverError(
-        f"static start: forces still change by {np.abs(change).max():.3g} N after 50 iterations; "
-        f"limit {1e-11 * scale:.3g} N"
-    )
+    rest = np.zeros(len(unit.weight))
+    rest[unit.wheelsets] = compliance @ force + roughness + compression_of(force, *law)
+    free = np.setdiff1d(np.arange(len(rest)), unit.wheelsets)
+    load = unit.weight[free] - unit.stiffness[np.ix_(free, unit.wheelsets)] @ rest[unit.wheelsets]
+    rest[free] = np.linalg.solve(unit.stiffness[np.ix_(free, free)], load)
+    return rest, force
