@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from .kinematics import Fit, Motion, regress
+from .kinematics import POSITION_SIGMA, Fit, Motion, regress
 from .pattern import Trace
 
 Array = NDArray[np.float64]
@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 _HALF = 1.25  # m either side of a wheelset that belongs to it
 _STEP = 0.1  # m
 _CELL = 0.2  # m, averaging of the energy
-_ROUNDS = 4
+_ROUNDS = 5
+_FREE_POSITION = 0.3  # m, of a channel while only spacings are compared
 _COVERED = 0.6  # part of a wheelset's window that must have been measured
 
 
@@ -42,6 +43,7 @@ class AxleFit:
     observed: NDArray[np.bool_]
     offset: Array
     prior_cost: float
+    anchor_sigma: Array
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -69,15 +71,15 @@ def _windows(trace: Trace, motion: Motion, places: Array, half: float) -> tuple[
     return energy, covered
 
 
-def _pulse(energy: Array, shift: Array, floor: float, classes: NDArray[np.int64]) -> Array:
-    """Mean pulse per class, aligned, on the grid of the energies, shape (4, cells), mean 1."""
+def _pulse(energy: Array, floor: float, classes: NDArray[np.int64], symmetric: bool) -> Array:
+    """Mean pulse per class on the grid of the energies, shape (4, cells), mean 1.
+
+    The plain mean gives the finest spacing of wheelsets but no place: it takes up an error common to
+    all of them. ``symmetric``: the pulse of a leading wheelset is the mirror image of a trailing
+    one's, which fixes the place.
+    """
     cells = energy.shape[1]
-    index = np.arange(cells)[None, :] + shift[:, None] / _STEP
-    low = np.clip(np.floor(index).astype(int), 0, cells - 2)
-    part = np.clip(index - low, 0.0, 1.0)
-    rows = np.arange(len(energy))[:, None]
-    aligned = energy[rows, low] * (1 - part) + energy[rows, low + 1] * part
-    scaled = aligned / np.maximum(aligned.mean(axis=1, keepdims=True), floor)
+    scaled = energy / np.maximum(energy.mean(axis=1, keepdims=True), floor)
     out = np.ones((4, cells))
     for c in range(4):
         members = classes == c
@@ -89,13 +91,12 @@ def _pulse(energy: Array, shift: Array, floor: float, classes: NDArray[np.int64]
             shape = np.mean(scaled, axis=0)
         smooth = np.convolve(np.pad(shape, 2, "edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         out[c] = smooth / smooth.mean()
-    # a mirror image of the leading wheelset's pulse is the trailing one's: without this symmetry
-    # the pulse would take up a common error of all places, and two channels no distance
-    before, behind = out[1].copy(), out[2].copy()
-    out[0], out[3] = 0.5 * (out[0] + out[0, ::-1]), 0.5 * (out[3] + out[3, ::-1])
-    if (classes == 1).any() and (classes == 2).any():
-        out[1] = 0.5 * (before + behind[::-1])
-        out[2] = out[1, ::-1]
+    if symmetric:
+        before, behind = out[1].copy(), out[2].copy()
+        out[0], out[3] = 0.5 * (out[0] + out[0, ::-1]), 0.5 * (out[3] + out[3, ::-1])
+        if (classes == 1).any() and (classes == 2).any():
+            out[1] = 0.5 * (before + behind[::-1])
+            out[2] = out[1, ::-1]
     return out
 
 
@@ -134,11 +135,28 @@ def _first_shift(energy: Array, reach: float) -> Array:
     return np.asarray((np.argmax(part, axis=1) - steps) * _STEP)
 
 
+def _anchor(offset: Array, classes: NDArray[np.int64]) -> tuple[float, float]:
+    """Place of the plain pulses against the symmetric ones (m), and its standard deviation.
+
+    Leading and trailing wheelsets have pulses of their own; where these are not mirror images of
+    each other, the places they give differ, and tell how little the symmetry is worth.
+    """
+    places, sigmas = [], []
+    for c in np.unique(classes):
+        members = offset[classes == c]
+        if members.size >= 3:
+            places.append(float(np.median(members)))
+            sigmas.append(1.86 * np.median(np.abs(members - places[-1])) / np.sqrt(members.size))
+    if not places:
+        return float(np.median(offset)), 0.3
+    spread = max(places) - min(places)
+    return float(np.mean(places)), float(np.hypot(np.mean(sigmas), spread))
+
+
 def fit_axles(
     traces: Sequence[Trace],
     places: Sequence[Array],
     start: Motion,
-    free_start: bool = True,
 ) -> AxleFit:
     """Times of the wheelsets of a train at every rail channel, and its motion.
 
@@ -146,7 +164,6 @@ def fit_axles(
         traces: rail channels.
         places: per trace, distance s (m) at which each wheelset passes it.
         start: rough motion, good to about 1 m everywhere.
-        free_start: look for the strongest place first (else trust ``start`` to 0.3 m).
     """
     motion = start
     count = places[0].size
@@ -159,31 +176,37 @@ def fit_axles(
     shape = (len(traces), count)
     time, contrast = np.zeros(shape), np.zeros(shape)
     observed = np.zeros(shape, dtype=bool)
+    anchor = np.zeros(len(traces))
+    anchor_sigma = np.zeros(len(traces))
     for round_ in range(_ROUNDS):
+        last = round_ == _ROUNDS - 1
         for k, trace in enumerate(traces):
             energy, covered = _windows(trace, motion, places[k], half)
-            if round_ == 0 and free_start:
+            if round_ == 0:
                 shift = _first_shift(energy, reach)
             else:
-                predicted = np.zeros(count)
-                pulse = _pulse(energy, predicted, trace.noise, classes)
-                shift = _best_shift(energy, pulse[classes], trace.noise, min(reach, 0.6))
+                near = min(reach, 0.6)
+                pulse = _pulse(energy, trace.noise, classes, symmetric=False)
+                shift = _best_shift(energy, pulse[classes], trace.noise, near)
+                if last:
+                    pulse = _pulse(energy, trace.noise, classes, symmetric=True)
+                    centred = _best_shift(energy, pulse[classes], trace.noise, near)
+                    anchor[k], anchor_sigma[k] = _anchor(centred - shift, classes)
             centre = motion.time_at(places[k])
             speed = np.maximum(motion.speed_at(centre), 0.5)
-            time[k] = centre + shift / speed
+            time[k] = centre + (shift + anchor[k]) / speed
             middle = energy.shape[1] // 2
-            near = energy[:, middle - 4 : middle + 5].mean(axis=1)
+            at = energy[:, middle - 4 : middle + 5].mean(axis=1)
             beside = np.minimum(energy[:, :6].mean(axis=1), energy[:, -6:].mean(axis=1))
-            contrast[k] = np.log(np.maximum(near, trace.noise)) - np.log(
-                np.maximum(beside, trace.noise)
-            )
+            contrast[k] = np.log(np.maximum(at, trace.noise) / np.maximum(beside, trace.noise))
             observed[k] = covered > _COVERED
         flat_time = time[observed]
         flat_place = np.stack(list(places))[observed]
         if flat_time.size < 4:
             break
         channel = np.nonzero(observed)[0]
-        fit = regress(flat_time, flat_place, channel, motion.epoch)
+        sigma = float(np.hypot(POSITION_SIGMA, anchor_sigma.max())) if last else _FREE_POSITION
+        fit = regress(flat_time, flat_place, channel, motion.epoch, position_sigma=sigma)
         motion = fit.motion
         if motion.speed < 1.0:
             break
@@ -198,5 +221,6 @@ def fit_axles(
         contrast=contrast,
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
+        anchor_sigma=anchor_sigma,
         prior_cost=fit.prior_cost if fit is not None else float("inf"),
     )

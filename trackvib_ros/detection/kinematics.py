@@ -21,9 +21,9 @@ PRIOR_ACCELERATION = 0.6
 """Prior standard deviation of the acceleration (m/s²): short records cannot show it."""
 
 
-POSITION_SIGMA = 0.05
-"""Standard deviation (m) of the place where a rail sensor seems to be; of rail passages computed
-with sensors at different places in a bay."""
+POSITION_SIGMA = 0.035
+"""Standard deviation (m) of the place where a rail sensor seems to be, when its pulses are
+symmetric; from rail passages computed with sensors at different places in a bay."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ CONFIRM_CORRELATION = 0.6
 HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
 
-_POSTERIOR_TEMPER = 0.7  # residuals of neighbouring wheelsets are not quite independent
+_POSTERIOR_TEMPER = 0.5  # all wheelsets meet the same rail: their residuals are not independent
+_MODEL_SIGMA = 0.03  # m, systematic residuals of a right type (bogies nod, pulses overlap)
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
 _MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
@@ -393,7 +394,7 @@ def ranked(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     spreads = []
     for h in hypotheses:
         residual = np.clip(h.fit.residual[h.fit.observed], -0.4, 0.4)
-        spreads.append(float(np.sqrt(np.mean(residual**2) + 0.02**2)))
+        spreads.append(float(np.sqrt(np.mean(residual**2) + _MODEL_SIGMA**2)))
     least = min(spreads)
     top = max(h.score for h in hypotheses)
     logs = []
