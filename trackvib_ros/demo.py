@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import signal
 import subprocess
 import sys
@@ -28,12 +27,17 @@ from trackvib_ros.report import PassageReport
 
 GRACE_S = 10.0
 """Time that a process gets to end before it is killed (s)."""
+QUIET_LOG = ["--ros-args", "--disable-external-lib-logs"]
+"""No log files of ROS's own: what the nodes say is in their output."""
 _PR_SET_PDEATHSIG = 1
 
 
 def _end_with_parent() -> None:
     """In a child: end when the parent dies, however it dies."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+MEND_DISK = "free some space or choose another place with -o"
 
 
 class Child:
@@ -47,7 +51,7 @@ class Child:
         log: Path,
     ) -> None:
         self.name, self.log = node, log
-        arguments = [sys.executable, "-m", "trackvib_ros.start", node, "--ros-args"]
+        arguments = [sys.executable, "-m", "trackvib_ros.start", node, *QUIET_LOG]
         for name, setting in parameters.items():
             text = str(setting).lower() if isinstance(setting, bool) else str(setting)
             arguments += ["-p", f"{name}:={text}"]
@@ -104,7 +108,7 @@ class Watcher:
     """A ROS node that follows the run for the progress display."""
 
     def __init__(self) -> None:
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=QUIET_LOG, signal_handler_options=SignalHandlerOptions.NO)
         self.seen = Seen()
         self._node = rclpy.create_node("demo", enable_rosout=False)
         self._executor = SingleThreadedExecutor()
@@ -186,8 +190,6 @@ def run_demo(
     stop = Stop()
     bag, logs = directory / "bag", directory / "log"
     logs.mkdir()
-    environment = {**environment, "ROS_LOG_DIR": str(logs)}
-    os.environ["ROS_LOG_DIR"] = str(logs)
     common = {"autostart": True}
     children: list[Child] = []
     watcher = Watcher()
@@ -223,11 +225,11 @@ def run_demo(
     if stop:
         console.print(_what_is_left(bag))
         return 130
+    if watcher.seen.trouble:
+        raise InputError(f"{watcher.seen.trouble}; {MEND_DISK}")
     for child in children:
         if child.status != 0:
-            raise InputError(f"{child.name} node: {child.complaint()}")
-    if watcher.seen.trouble:
-        raise InputError(watcher.seen.trouble)
+            raise InputError(f"{child.name} node: {child.complaint()} (log: {child.log})")
     return _tell(bag, directory, figure, console)
 
 

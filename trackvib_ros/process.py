@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar
 
 import rclpy
 from rcl_interfaces.msg import (
@@ -211,9 +211,9 @@ def _finish(node: LifecycleNode) -> None:
         node.trigger_shutdown()
 
 
-def main(create: Callable[[Stop], Any]) -> None:
-    """Entry of a node's process."""
-    status = run(create, sys.argv)
+def main(create: Callable[[Stop], Any], arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run a node (see :func:`run`) and end the process; ``arguments`` default to its own."""
+    status = run(create, sys.argv if arguments is None else arguments)
     if any(thread.name == "background" for thread in threading.enumerate()):
         # a task left behind cannot be cancelled, and waiting for it would not end in time
         sys.stdout.flush()

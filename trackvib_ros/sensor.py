@@ -7,6 +7,7 @@ carries its state from block to block, so cutting the input differently gives th
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterable, Sequence
 
@@ -56,7 +57,7 @@ def anti_alias_taps(bandwidth: float, rate: float, solver_rate: float) -> NDArra
 
     def excess(cutoff: float) -> float:
         gain = float(taps(cutoff) @ np.cos(2 * np.pi * bandwidth * lags))
-        return gain - 0.5**0.5
+        return gain - math.sqrt(0.5)
 
     return taps(float(brentq(excess, bandwidth * 0.5, bandwidth + transition / 2, xtol=1e-9)))
 

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from trackvib_ros.environment import complete
 from trackvib_ros.process import Stop
 
-DEADLINE_S = 40.0
+DEADLINE_S = 120.0
 QUICK = Path(__file__).with_name("quick.toml")
 FIRST_DOMAIN = 11
 

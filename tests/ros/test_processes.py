@@ -77,8 +77,8 @@ def test_killed_detector_is_missed_by_the_sensor_which_goes_on(
     graph: Graph, processes: Processes
 ) -> None:
     diagnostics = graph.listen(m.DIAGNOSTICS)
-    sensor = processes.node("sensor", scenario=SCENARIO, real_time_factor=1.0, headway_mean=1.0)
-    detector = processes.node("detector", use_sim_time=True)
+    sensor = processes.command("sensor", "--scenario", SCENARIO, "--headway", "1")
+    detector = processes.command("detect")
 
     def blocks() -> int:
         return int(figures(diagnostics, "detector: input").get("blocks rail/waveform", "0"))

@@ -74,13 +74,13 @@ def _node(module: str, parameters: dict[str, object], namespace: str) -> None:
     for name, setting in parameters.items():
         text = str(setting).lower() if isinstance(setting, bool) else str(setting)
         arguments += ["-p", f"{name}:={text}"]
-    from trackvib_ros.process import run
+    from trackvib_ros.process import main
 
     if module == "sensor":
         from trackvib_ros.sensor_node import SensorNode as Node
     else:
         from trackvib_ros.detector_node import DetectorNode as Node
-    raise typer.Exit(run(Node, arguments))
+    main(Node, arguments)
 
 
 NamespaceOption = Annotated[str, typer.Option("--namespace", "-n", help="ROS namespace.")]
