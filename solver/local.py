@@ -167,6 +167,7 @@ class RailWaves:
         cells: groups of frequencies.
         receptances: (X, F) driving-point receptances over a bay (m/N).
         weights: (F,) of travelling energy, sum 1 in each cell.
+        share: (F,) part of a wheel's power that travels away.
         decay: (N,) energy decay (1/m). velocity: (N,) energy velocity (m/s).
         to_slab: (N,) part of the power into the rail that its fastenings hand to the slab.
     """
@@ -175,6 +176,7 @@ class RailWaves:
     cells: Cells
     receptances: Complex
     weights: Real
+    share: Real
     decay: Real
     velocity: Real
     to_slab: Real
@@ -204,7 +206,7 @@ class RailWaves:
         loads = periodic.load_positions(12)
         points = np.stack([solution.receptance(x, x) for x in loads])
         radiated = (1j * omega * points).real / np.abs(points + 1 / stiffness) ** 2
-        power = radiated.mean(axis=0)
+        power = radiated.mean(axis=0) * waves.share
         energy = power / waves.energy_velocity
         weights = energy / cells.sum(energy)[cells.of]
         left = cells.sum(weights * np.exp(-waves.decay * REFERENCE_DISTANCE))
@@ -218,6 +220,7 @@ class RailWaves:
             cells,
             points,
             weights,
+            waves.share,
             -np.log(left) / REFERENCE_DISTANCE,
             cells.sum(power) / cells.sum(energy),
             cells.sum(power * share) / cells.sum(power),
@@ -307,7 +310,9 @@ def local_wheel(
 
     weight = np.abs(gain) ** 2
     radiated = (weight * (1j * series * waves.receptances).real).mean(axis=0)
-    conductance = cells.sum(radiated) / POINTS_PER_BAND / cells.band_mean(weight.mean(axis=0))
+    conductance = (
+        cells.sum(radiated * waves.share) / POINTS_PER_BAND / cells.band_mean(weight.mean(axis=0))
+    )
 
     window = waves.periodic.spacing * 2
     grid = np.arange(0.0, length + GRID, GRID)
@@ -534,7 +539,8 @@ class LocalField:
             at = solution.receptance(place + d, place + d)
             speed = np.abs(omega * solution.receptance(place + d, place)) ** 2
             exact[:, i] = cells.sum(speed / np.abs(at + soft) ** 2) / mean_gain
-        power = cells.sum(((1j * omega * waves.receptances).real * gain).mean(axis=0)) / mean_gain
+        power = ((1j * omega * waves.receptances).real * gain).mean(axis=0) * waves.share
+        power = cells.sum(power) / mean_gain
         far = power / (2 * periodic.beam.mass_per_length * waves.velocity) * self._pattern(channel)
         near = exact - far[:, None] * np.exp(-waves.decay[:, None] * np.abs(offset))
         # leave the far field smoothly

@@ -740,6 +740,11 @@ class ModalRun:
     ratio = 1
 
     @property
+    def states(self) -> int:
+        """Number of modes that are stepped."""
+        return len(self.line.eigenvalues)
+
+    @property
     def channel_band(self) -> Array:
         """(C,) valid band of every channel (Hz)."""
         return self.line.channel_band

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .hybrid import HybridRun
+from .line import assemble
 from .modal import ModalRun
 from .modes import modal_line
 from .motion import TrainMotion
+from .newmark import NewmarkRun
 from .quality import QualityReport
 from .scenario import Scenario, Train
 from .traffic import Traffic
@@ -87,9 +89,11 @@ class Simulation:
         _check_step(scenario)
         derivatives = tuple(OUTPUTS.index(name) for name in self._outputs)
         tell("modes of the line: computed once, then kept")
-        self._run: ModalRun | HybridRun
+        self._run: ModalRun | HybridRun | NewmarkRun
         if scenario.solution.model == "hybrid":
             self._run = HybridRun(scenario, self._traffic, derivatives)
+        elif scenario.solution.integrator == "newmark":
+            self._run = NewmarkRun(assemble(scenario), self._traffic, derivatives)
         else:
             self._run = ModalRun(modal_line(scenario), self._traffic, derivatives)
         tell(f"{self.states} modes; compiling or loading the stepping kernel")
@@ -109,8 +113,13 @@ class Simulation:
 
     @property
     def states(self) -> int:
-        """Number of modes that are stepped."""
-        return len(self._run.line.eigenvalues)
+        """Number of modes, or with Newmark coordinates, that are stepped."""
+        return self._run.states
+
+    @property
+    def step_ratio(self) -> int:
+        """Samples per step of the deterministic set: 1, more for the hybrid."""
+        return self._run.ratio
 
     @property
     def train_of_wheelset(self) -> NDArray[np.intp]:

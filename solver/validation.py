@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .scenario import load_scenario
+from .hybrid import crossover_frequency
+from .scenario import Scenario, build_scenario, load_scenario
+from .simulation import Simulation
 from .statistics import (
     Partition,
     Response,
@@ -170,3 +173,195 @@ def ensemble_study(
             BandError(float(centre), loss * near / gap, forms, decibel(levels, 1.0).std(axis=0))
         )
     return result
+
+
+def comparison_scenario(
+    model: Literal["fe", "hybrid"], seed: int, crossover: float | None = None
+) -> Scenario:
+    """One wheel element at 300 km/h over CRTS II track, seven rail channels within two bays."""
+    spacing = 0.65
+    places = 32.5 + spacing * np.array([0.0, 0.25, 0.5, 1.0, 1.3, 1.5, 1.75])
+    channels = [{"name": f"rail_{i}", "layer": "rail", "x": float(x)} for i, x in enumerate(places)]
+    channels += [
+        {"name": layer, "layer": layer, "x": 36.0} for layer in ("slab", "support_layer", "bridge")
+    ]
+    solution: dict[str, object] = {"model": model, "seed": seed, "end_time": 1.4}
+    if crossover is not None:
+        solution["crossover"] = crossover
+    return build_scenario(
+        {
+            "line": {"approach_left": 20.0, "spans": [32.0], "approach_right": 20.0},
+            "train": [{"preset": "wheel_element", "speed": "300 km/h", "start": -30.0}],
+            "contact": {"law": "linear"},
+            "irregularity": {"spectrum": "sato", "seed": seed},
+            "channel": channels,
+            "solution": solution,
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One passage. Rail channels come first.
+
+    Attributes:
+        force: (n,) N. place: (n,) m, of the wheelset.
+        acceleration, displacement: (n, C).
+        modes, step, ratio: of the deterministic set: its size, the output's step (s) and the steps
+            of the output that one of its steps spans.
+        preparation, stepping: CPU time (s).
+    """
+
+    force: Real
+    place: Real
+    acceleration: Real
+    displacement: Real
+    modes: int
+    step: float
+    ratio: int
+    preparation: float
+    stepping: float
+
+
+def run_passage(scenario: Scenario) -> Run:
+    """Run a scenario of one wheelset to its end."""
+    begin = time.process_time()
+    simulation = Simulation(scenario, outputs=("displacement", "acceleration"))
+    blocks = [simulation.advance(100)]
+    middle = time.process_time()
+    blocks += list(simulation.blocks(8000))
+    end = time.process_time()
+    return Run(
+        np.concatenate([block.wheelset_force[:, 0] for block in blocks]),
+        np.concatenate([block.wheelset_position[:, 0] for block in blocks]),
+        np.concatenate([block.acceleration for block in blocks if block.acceleration is not None]),
+        np.concatenate([block.displacement for block in blocks if block.displacement is not None]),
+        simulation.states,
+        simulation.step_ns * 1e-9,
+        simulation.step_ratio,
+        middle - begin,
+        end - middle,
+    )
+
+
+COMPARED = 10 ** (np.arange(20, 38) / 10)
+"""Exact centres (Hz) of the third octaves 100 Hz to 5 kHz."""
+
+DISTANCES = (0.0, 5.0, 10.0, 15.0)
+"""Distances (m) of wheel and channel at which envelopes are compared."""
+
+WINDOW = 0.02
+"""Length (s) of the running mean square."""
+
+
+def band_signals(signal: Real, step: float, centres: Real = COMPARED) -> Real:
+    """Third-octave parts of a signal, ideal filters: (B, n) from (n,)."""
+    spectrum = np.fft.rfft(signal)
+    frequency = np.fft.rfftfreq(len(signal), step)
+    out = np.empty((len(centres), len(signal)))
+    for i, centre in enumerate(centres):
+        inside = (frequency >= centre * 10**-0.05) & (frequency < centre * 10**0.05)
+        out[i] = np.fft.irfft(np.where(inside, spectrum, 0), len(signal))
+    return out
+
+
+def envelopes(run: Run, channel_x: Real) -> Real:
+    """Mean squares in WINDOW at DISTANCES, both sides, mean over the rail channels, (D, B)."""
+    half = round(WINDOW / run.step / 2)
+    total = np.zeros((len(DISTANCES), len(COMPARED)))
+    for c, x in enumerate(channel_x):
+        squares = np.cumsum(band_signals(run.acceleration[:, c], run.step) ** 2, axis=1)
+        for d, distance in enumerate(DISTANCES):
+            for side in (-1, 1):
+                at = int(np.argmin(np.abs(run.place - (x + side * distance))))
+                total[d] += (squares[:, at + half] - squares[:, at - half]) / (2 * half)
+    return np.asarray(total / (2 * len(channel_x)))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """hybrid against fe over several seeds of roughness; dB are hybrid less fe.
+
+    Attributes:
+        crossover: f_g (Hz).
+        level: (seeds, B) dB, rail acceleration over the passage, mean of the channels.
+        mean_level: (B,) dB of the seed means. layers: {layer: (B,) dB of the seed means}.
+        envelope: (D, B) dB of the seed means. spread: (D, B) dB, standard error of ``envelope``.
+        force_level: (B,) dB of the seed means. force_rms: (seeds,) ratio of the rms about the mean.
+        displacement: (seeds,) largest relative difference of rail displacement peaks.
+        fe, hybrid: the runs of the last seed.
+    """
+
+    crossover: float
+    level: Real
+    mean_level: Real
+    layers: dict[str, Real]
+    envelope: Real
+    spread: Real
+    force_level: Real
+    force_rms: Real
+    displacement: Real
+    fe: Run
+    hybrid: Run
+
+
+def compare_models(seeds: int = 8, crossover: float | None = None) -> Comparison:
+    """Run both models over ``seeds`` realisations and compare them."""
+    found: dict[str, list[dict[str, Real]]] = {"fe": [], "hybrid": []}
+    runs: dict[str, Run] = {}
+    for seed in range(1, seeds + 1):
+        for model in ("fe", "hybrid"):
+            scenario = comparison_scenario(model, seed, crossover)
+            run = run_passage(scenario)
+            runs[model] = run
+            x = np.array([c.x for c in scenario.channel if c.layer == "rail"])
+            on = (run.place > 5) & (run.place < scenario.line.length - 5)
+            force = run.force[on] - run.force[on].mean()
+            parts = band_signals(force, run.step)
+            below = np.fft.rfftfreq(len(force), run.step) < scenario.solution.frequency_limit
+            limited = np.fft.irfft(np.where(below, np.fft.rfft(force), 0), len(force))
+            squares = np.array(
+                [
+                    (band_signals(run.acceleration[:, c], run.step) ** 2).mean(axis=1)
+                    for c in range(run.acceleration.shape[1])
+                ]
+            )
+            found[model].append(
+                {
+                    "rail": squares[: len(x)].mean(axis=0),
+                    "slab": squares[len(x)],
+                    "support_layer": squares[len(x) + 1],
+                    "bridge": squares[len(x) + 2],
+                    "envelope": envelopes(run, x),
+                    "force": (parts**2).mean(axis=1),
+                    "rms": np.array(limited.std()),
+                    "peak": np.abs(run.displacement[:, : len(x)]).max(axis=0),
+                }
+            )
+
+    def mean(model: str, name: str) -> Real:
+        return np.asarray(np.mean([entry[name] for entry in found[model]], axis=0))
+
+    def every(model: str, name: str) -> Real:
+        return np.array([entry[name] for entry in found[model]])
+
+    relative = [
+        every(model, "envelope").std(axis=0, ddof=1) / mean(model, "envelope") / math.sqrt(seeds)
+        for model in ("fe", "hybrid")
+    ]
+    return Comparison(
+        crossover_frequency(comparison_scenario("hybrid", 1, crossover)),
+        decibel(every("hybrid", "rail"), every("fe", "rail")),
+        decibel(mean("hybrid", "rail"), mean("fe", "rail")),
+        {
+            layer: decibel(mean("hybrid", layer), mean("fe", layer))
+            for layer in ("slab", "support_layer", "bridge")
+        },
+        decibel(mean("hybrid", "envelope"), mean("fe", "envelope")),
+        np.asarray(10 / math.log(10) * np.hypot(*relative)),
+        decibel(mean("hybrid", "force"), mean("fe", "force")),
+        every("hybrid", "rms") / every("fe", "rms"),
+        np.abs(every("hybrid", "peak") / every("fe", "peak") - 1).max(axis=1),
+        runs["fe"],
+        runs["hybrid"],
+    )

@@ -168,12 +168,15 @@ class BlochField:
         energy_velocity: power / (m' <v^2>) with <v^2> the mean over a bay (m/s), shape (F,).
         pattern: |v(x)|^2 / <v^2> at the places asked for, shape (F, P).
         strain_pattern: |theta'(x)|^2 / <v^2> (s^2/m^2 * 1/m^2), shape (F, P).
+        share: part of a load's power, mean over the bay, that this wave takes; the rest stays in
+            the near field, shape (F,).
     """
 
     decay: Real
     energy_velocity: Real
     pattern: Real
     strain_pattern: Real
+    share: Real
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,8 +379,10 @@ class BlochSolution:
         """
         w, rail = self.omega, self.rail
         x = np.atleast_1d(np.asarray(places, dtype=np.float64)) % rail.spacing
-        wave = self.states[:, :, 0]
-        decay = -2 * np.log(np.abs(self.values[:, 0])) / rail.spacing
+        chosen, share = self._main_wave()
+        row = np.arange(w.size)
+        wave = self.states[row, :, chosen]
+        decay = -2 * np.log(np.abs(self.values[row, chosen])) / rail.spacing
 
         def square(place: float) -> tuple[Real, Real]:
             # Removing the mean decay leaves the periodic part of the wave.
@@ -389,8 +394,7 @@ class BlochSolution:
 
         samples = [square(place)[0] for place in rail.load_positions(24)]
         mean = np.mean(samples, axis=0)
-        velocity = 1j * w[:, None] * wave[:, :2]
-        power = -np.real(wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj())
+        power = self._power(wave)
         # The rail itself loses nothing: the power falls in one step at the support in mid-bay.
         # With the smooth decay removed its mean over the bay is the factor sinh(h)/h.
         h = decay * rail.spacing / 2
@@ -403,4 +407,28 @@ class BlochSolution:
             mean_power / (rail.beam.mass_per_length * mean),
             speed / mean[:, None],
             bending / mean[:, None],
+            share,
         )
+
+    def _power(self, wave: Complex) -> Real:
+        """Power (twice the mean) that passes the start of the bay towards +x, (F,)."""
+        velocity = 1j * self.omega[:, None] * wave[:, :2]
+        return -np.real(wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj())
+
+    def _main_wave(self) -> tuple[NDArray[np.intp], Real]:
+        """Which of the two right-going waves carries more, and its part of the input power, (F,).
+
+        Above sqrt(kGA/rho I) a Timoshenko beam has a second travelling wave.
+        """
+        carried = np.zeros((2, self.omega.size))
+        given = np.zeros(self.omega.size)
+        for load in self.rail.load_positions(6):
+            amplitude = np.abs(self._excite(float(load))) ** 2
+            given += (1j * self.omega * self.receptance(float(load), float(load))).real / 2
+            for j in (0, 1):
+                # amplitudes refer to the bay's start; the support in mid-bay takes its part
+                passed = np.abs(self.values[:, j]) ** 2 if load > self.rail.spacing / 2 else 1.0
+                carried[j] += amplitude[:, j] * self._power(self.states[:, :, j]) * passed
+        chosen = np.argmax(carried, axis=0)
+        best = carried[chosen, np.arange(self.omega.size)]
+        return chosen, np.clip(best / given, 0.0, 1.0)
