@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ SCENARIO = "scenario"
 _BEST_EFFORT_DEPTH = 2000
 _DISCOVERY_PERIOD_S = 0.1
 _POLL_PERIOD_S = 0.005
+_CLOSE_S = 5.0
 _HELD_BYTES = 16 << 20
 
 
@@ -57,7 +58,7 @@ class _Source:
     subscription: Any
     publishers: int
     recorded: bool
-    last_sequence: int = 0
+    last_sequences: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -76,8 +77,7 @@ class Recorder:
 
     Reliable topics are subscribed with unlimited history: when the queue is full, messages stay in
     the middleware, which holds publishers of unlimited history back. What is lost nevertheless
-    shows as a gap in the publisher's sequence numbers and is counted in :attr:`drops`; with more
-    than one publisher on a topic the numbers do not tell.
+    shows as a gap in the publisher's sequence numbers and is counted in :attr:`drops`.
 
     Attributes:
         skipped: topics that cannot be recorded, with the reason.
@@ -133,6 +133,7 @@ class Recorder:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._error: str | None = None
         self._writer = BagWriter(
             directory,
             custom_data=custom_data,
@@ -151,7 +152,7 @@ class Recorder:
     @property
     def failure(self) -> str | None:
         """Why recording stopped by itself (disk full ...), None while all is well."""
-        return self._writer.failure
+        return self._error or self._writer.failure
 
     @property
     def counts(self) -> dict[str, int]:
@@ -209,8 +210,11 @@ class Recorder:
         with self._lock:
             if self._closed:
                 return
-            if self.failure is None and self._node.context.ok():
-                self._take()
+            deadline = time.monotonic() + _CLOSE_S
+            while self.failure is None and self._node.context.ok() and time.monotonic() < deadline:
+                if not self._take() and not self._writer.full:
+                    break
+                time.sleep(_POLL_PERIOD_S)
             for arrival in self._held:
                 self._writer.write(arrival.topic, 0, arrival.source_ns, arrival.data)
             self._held.clear()
@@ -222,7 +226,13 @@ class Recorder:
         while not self._stop.wait(_POLL_PERIOD_S):
             if not self._node.context.ok():
                 return
-            self.poll()
+            try:
+                self.poll()
+            except Exception as failure:
+                # A thread that dies unseen would be a silent loss.
+                self._error = f"recording to {self.directory} stopped: {failure!r}"
+                self._node.get_logger().error(self._error)
+                return
 
     def _discover(self) -> None:
         for name, types in self._node.get_topic_names_and_types():
@@ -300,12 +310,20 @@ class Recorder:
         return len(arrivals)
 
     def _check_sequence(self, source: _Source, sequence: int | None) -> None:
+        """Count what is missing before this number of its publisher.
+
+        The middleware does not say whose number it is: it continues the publisher whose last one
+        fits, else starts another one as long as fewer are known than there are.
+        """
         if sequence is None:
             return
-        missing = sequence - source.last_sequence - 1
-        if source.last_sequence and missing > 0 and source.publishers == 1:
-            self._lost[source.topic] += missing
-        source.last_sequence = sequence
+        lasts = source.last_sequences
+        before = max((last for last in lasts if last < sequence), default=None)
+        if before is None or (before < sequence - 1 and len(lasts) < source.publishers):
+            lasts.append(sequence)
+            return
+        self._lost[source.topic] += sequence - before - 1
+        lasts[lasts.index(before)] = sequence
 
     def _put(self, arrival: _Arrival) -> None:
         if self._use_sim_time:
@@ -380,9 +398,12 @@ def _stored_qos(profile: QoSProfile) -> Qos:
 
 
 def _clock_ns(cdr: bytes) -> int:
-    """Return the time of a serialized ``rosgraph_msgs/Clock``; byte 1 tells the byte order."""
+    """Return the time (ns) of a serialized ``rosgraph_msgs/Clock``, which is never negative.
+
+    Byte 1 of CDR tells the byte order.
+    """
     seconds, nanoseconds = struct.unpack_from("<iI" if cdr[1] & 1 else ">iI", cdr, 4)
-    return int(seconds) * 10**9 + int(nanoseconds)
+    return max(0, int(seconds) * 10**9 + int(nanoseconds))
 
 
 def _scenario_data(cdr: bytes) -> dict[str, str]:

@@ -160,8 +160,13 @@ def test_simulated_time_of_the_log(node: Node, tmp_path: Path) -> None:
     recorder = Recorder(node, tmp_path / "sim", use_sim_time=True)
     wanted = {"/scenario", "/acceleration", "/clock"}
     until(lambda: wanted <= set(recorder.topics), "discovery", recorder.poll)
-    until(lambda: stream.get_subscription_count() == clock.get_subscription_count() == 1, "match")
+    until(
+        lambda: all(p.get_subscription_count() == 1 for p in (state, stream, clock)),
+        "subscriptions of the recorder",
+    )
+    assert state.wait_for_all_acked()
     stream.publish(acceleration(0))
+    assert stream.wait_for_all_acked()
     for step in range(1, 51):
         # Wait for the first message, so that the order of arrival is the order of publication.
         message = Clock()
@@ -205,6 +210,37 @@ def test_recording_from_its_own_thread_beside_a_busy_executor(node: Node, tmp_pa
     assert list(reader.topics) == ["/acceleration"]
     stamps = [reader.decode(m).header.stamp.nanosec for m in reader.messages()]
     assert stamps == list(range(2000))
+
+
+def test_losses_are_counted_and_several_publishers_are_none(node: Node, tmp_path: Path) -> None:
+    """A recorder that does not poll loses messages once the middleware is full, and says so."""
+    recorder = Recorder(node, tmp_path / "slow", topics=["/acceleration", "/shared"])
+    lossy = node.create_publisher(AccelStamped, "/acceleration", 10)
+    shared = [node.create_publisher(String, "/shared", STREAM) for _ in range(2)]
+    publishers = [lossy, *shared]
+    until(lambda: all(p.get_subscription_count() == 1 for p in publishers), "match", recorder.poll)
+    for number in range(7000):
+        lossy.publish(acceleration(number))
+    for number in range(50):
+        shared[number % 3 // 2].publish(String(data=f"{number}"))
+    until(lambda: recorder.counts.get("/shared") == 50, "shared topic", recorder.poll)
+    sent = [7000]
+
+    def one_more() -> None:
+        lossy.publish(acceleration(sent[0]))
+        sent[0] += 1
+        recorder.poll()
+        time.sleep(0.1)
+
+    until(lambda: recorder.drops, "a number that shows what is missing", one_more)
+
+    def complete() -> bool:
+        recorder.poll()
+        return recorder.counts["/acceleration"] + recorder.drops["/acceleration"] == sent[0]
+
+    until(complete, "all messages received or counted as lost")
+    recorder.close()
+    assert set(recorder.drops) == {"/acceleration"}
 
 
 def test_existing_directory_is_refused_with_status_2(

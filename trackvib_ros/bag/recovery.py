@@ -78,8 +78,9 @@ def needs_recovery(directory: Path) -> bool:
         listed = [Path(name).name for name in metadata.read(directory)["relative_file_paths"]]
     except (InputError, FileNotFoundError):
         return any(directory.glob("*.mcap"))
-    numbered = {path.name for path in _files(directory)}
-    return bool(numbered - set(listed)) and all(name.endswith(".mcap") for name in listed)
+    recordings = {name.rpartition("_")[0] for name in listed if name.endswith(".mcap")}
+    found = {path.name for path in _files(directory)}
+    return any(name.rpartition("_")[0] in recordings for name in found - set(listed))
 
 
 def recover(directory: Path, *, verify: bool = True) -> RecoveryReport:
