@@ -266,3 +266,80 @@ def test_five_lines():
 def test_mistakes_are_named(make, named):
     with pytest.raises(InputError, match=named):
         make()
+
+
+def states(events):
+    return {(e.sensors[0], e.values["state"]) for e in of(events, "health") if e.quality}
+
+
+def faulty(change):
+    truth = Passage(CATALOGUE["CRH3"].axles, 60.0, start=14.0)
+    signals = record([truth], DEMO, 30)
+    for name, (rate, x) in signals.items():
+        signals[name] = (rate, change(name, rate, x.copy()))
+    return run(signals, DEMO), truth
+
+
+def test_dead_sensor_is_told_and_not_used():
+    def change(name, rate, x):
+        if name == "rail_a":
+            x[3 * rate :] = 0.25
+        return x
+
+    events, truth = faulty(change)
+    assert states(events) == {("rail_a", "dead"), ("rail_a", "insensitive")}
+    (passage,) = passages(events)
+    assert passage.sensors == ("rail_b",)
+    assert passage.values["direction"] == "unknown"
+    assert passage.values["speed"].value == pytest.approx(60.0, rel=4e-3)
+    assert passage.stamp_ns * 1e-9 == pytest.approx(truth.axle_times(20.0)[0], abs=5e-3)
+
+
+def test_dropped_out_sensor_is_told():
+    def change(name, rate, x):
+        if name == "rail_b":
+            x[5 * rate : 10 * rate] = np.nan
+        return x
+
+    events, _ = faulty(change)
+    told = [(e.values["state"], e.values["present"]) for e in of(events, "health")]
+    assert told == [("dropped_out", "yes"), ("dropped_out", "no")]
+    assert passages(events)[0].sensors == ("rail_a", "rail_b")
+
+
+def test_drifting_sensor_is_told():
+    def change(name, rate, x):
+        if name == "slab_mid":
+            x += np.where(np.arange(x.size) > 8 * rate, 30.0, 0.0)
+        return x
+
+    events, _ = faulty(change)
+    assert ("slab_mid", "drifting") in states(events)
+    assert passages(events)[0].values["type"] == "CRH3"
+
+
+def test_clock_offset_is_told_and_measured():
+    def change(name, rate, x):
+        return np.roll(x, rate // 10) if name == "rail_b" else x
+
+    events, _ = faulty(change)
+    (health,) = [e for e in of(events, "health") if e.quality]
+    assert health.quality == ("unsynchronised",)
+    # 0.1 s late; good to the place of a pulse, 0.5 m at 60 m/s
+    assert health.values["clock_offset"].value == pytest.approx(0.1, abs=0.01)
+    (passage,) = passages(events)
+    assert passage.sensors == ("rail_a",)
+    assert "unsynchronised" in passage.quality
+    # one sensor: within the family
+    assert passage.values["speed"].value == pytest.approx(60.0, rel=9.5e-3)
+
+
+def test_exchanged_cables_are_told():
+    truth = Passage(CATALOGUE["articulated"].axles, 60.0)
+    channels = (Channel("rail_a", 0.0, "rail"), Channel("bridge_mid", 10.0, "bridge"))
+    signals = record([truth], channels, 30, rates={"rail": 2000, "bridge": 2000})
+    exchanged = {"rail_a": signals["bridge_mid"], "bridge_mid": signals["rail_a"]}
+    events = run(exchanged, channels)
+    assert ("bridge_mid", "swapped") in states(events)
+    (passage,) = passages(events)
+    assert passage.values["type"] == "articulated"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,11 @@ from trackvib_ros.waveform import Waveform
 
 from . import report
 from .catalogue import Catalogue
-from .events import Channel, TrainEvent
+from .events import Channel, Estimate, TrainEvent, Value
 from .features import FRAME, GroupStream
+from .health import HealthBook, clipped
 from .onset import Trigger
-from .passage import Record, find_passages
+from .passage import Passage, Record, excited, find_passages
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ _CHUNK_NS = 1_000_000_000
 _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
 _RISE = 10.0  # a train on rails that still ring
-_FADED = 1 / 300  # of the strongest level of an event: what is left is no train
+_FADED = 1 / 100  # of the strongest level of an event: what is left is no train
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
@@ -44,7 +45,7 @@ class DetectorConfig:
 
     min_speed: float = 10.0
     max_speed: float = 115.0
-    hang: float = 2.2
+    hang: float = 1.8
     max_event: float = 90.0
     max_lag: float = 1.0
 
@@ -118,6 +119,7 @@ class TrainDetector:
         self._start_ns: int | None = None
         self._done_ns = 0
         self._event: _Event | None = None
+        self._health = HealthBook(self.channels)
         self._lowest = np.full(len(self.channels), np.inf)
         self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
 
@@ -208,15 +210,26 @@ class TrainDetector:
         ready = []
         for order, group in enumerate(self._groups.values()):
             while group.next_bin + FRAME <= group.stream.bins:
-                end_ns, energy, valid = group.stream.frame(group.next_bin)
-                if end_ns > until_ns:
+                frame = group.stream.frame(group.next_bin)
+                if frame.end_ns > until_ns:
                     break
                 group.next_bin += FRAME
-                ready.append((end_ns, order, group, energy, valid))
+                ready.append((frame.end_ns, order, group, frame))
         ready.sort(key=lambda item: item[:2])
         events: list[TrainEvent] = []
-        for end_ns, _, group, energy, valid in ready:
-            active = group.trigger.step(energy, valid, frozen=self._event is not None)
+        for end_ns, _, group, frame in ready:
+            in_event = self._event is not None
+            active = group.trigger.step(frame.energy, frame.valid & ~frame.still, frozen=in_event)
+            events += self._health.step(
+                end_ns,
+                FRAME * group.stream.step,
+                group.index,
+                frame.mean,
+                np.sqrt(np.max(np.nan_to_num(group.trigger.floor, nan=np.inf), axis=1)),
+                frame.still,
+                frame.valid,
+                in_event,
+            )
             events += self._decide(end_ns, group, active)
         return events
 
@@ -290,7 +303,63 @@ class TrainDetector:
         flags = ["truncated_start"] if event.truncated else []
         limits = (self.config.min_speed, self.config.max_speed)
         found = find_passages(records, within, self.catalogue, limits, event.truncated)
-        return report.closing(self.catalogue, records, origin, within, found, flags)
+        if records and not any(passage.confirmed for passage in found):
+            found, swapped = self._try_swapped(records, within, limits, found)
+        else:
+            swapped = []
+        events = self._passage_health(now_ns, records, within, found, swapped)
+        return events + report.closing(self.catalogue, records, origin, within, found, flags)
+
+    def _try_swapped(
+        self,
+        records: list[Record],
+        within: tuple[float, float],
+        limits: tuple[float, float],
+        found: list[Passage],
+    ) -> tuple[list[Passage], list[str]]:
+        """Rail channels that show no wheelsets while others do: their cables are exchanged."""
+        if not any(r.channel.layer == "rail" for r in records):
+            return found, []
+        others = [
+            replace(r, channel=replace(r.channel, layer="rail"))
+            for r in records
+            if r.channel.layer != "rail"
+        ]
+        instead = find_passages(others, within, self.catalogue, limits) if others else []
+        sure = [p for p in instead if p.known]
+        return (sure, [trace.name for trace in sure[0].traces]) if sure else (found, [])
+
+    def _passage_health(
+        self,
+        now_ns: int,
+        records: list[Record],
+        within: tuple[float, float],
+        found: list[Passage],
+        swapped: list[str],
+    ) -> list[TrainEvent]:
+        events: list[TrainEvent] = []
+        trains = [passage for passage in found if passage.confirmed]
+        if not trains:
+            return events
+        used = {trace.name for trace in trains[0].traces}
+        offsets = {name: (o, sigma) for name, o, sigma in trains[0].clock_offset}
+        for record in records:
+            name = record.channel.name
+            inside = (record.window.time >= within[0]) & (record.window.time <= within[1])
+            if not inside.any():
+                continue
+            tell = self._health.tell
+            events += tell(now_ns, name, "clipped", clipped(record.window, inside), {})
+            events += tell(now_ns, name, "swapped", name in swapped, {})
+            if record.channel.layer != "rail" or name in swapped:
+                continue
+            quiet = name not in used and not excited(record, within)
+            events += tell(now_ns, name, "insensitive", quiet and not swapped, {})
+            values: dict[str, Value] = {}
+            if name in offsets:
+                values["clock_offset"] = Estimate(*offsets[name], "s")
+            events += tell(now_ns, name, "unsynchronised", name in offsets, values)
+        return events
 
 
 def detect(

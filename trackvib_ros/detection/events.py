@@ -140,7 +140,7 @@ class TrainEvent:
         values: dict[str, Value] = {}
         for name, text in pairs.items():
             stem, _, part = name.rpartition(".")
-            if name in _RESERVED or part in ("sigma", "unit") and f"{stem}.value" in pairs:
+            if name in _RESERVED or (part in ("sigma", "unit") and f"{stem}.value" in pairs):
                 continue
             if part == "value":
                 values[stem] = Estimate(

@@ -67,6 +67,25 @@ class Window:
     bands: tuple[tuple[float, float], ...]
 
 
+@dataclass(frozen=True)
+class Frame:
+    """About 10 ms of a group, per channel: see :class:`Window`.
+
+    Attributes:
+        end_ns: time after the frame.
+        energy: shape (channels, bands).
+        valid: mostly measured.
+        still: not one sample differs from the one before.
+        mean: of the raw samples.
+    """
+
+    end_ns: int
+    energy: Array
+    valid: NDArray[np.bool_]
+    still: NDArray[np.bool_]
+    mean: Array
+
+
 def bands_for(rate: float) -> tuple[tuple[float, float], ...]:
     """The bands that a sampling rate (Hz) can show."""
     usable = [(low, min(high, 0.45 * rate)) for low, high in BANDS]
@@ -122,7 +141,7 @@ class GroupStream:
         self.low_shift = front + _dc_delay(low_sos, inner)
         self._capacity = int(keep_s / self.step)
         n = len(channels)
-        columns = len(self.bands) + 5
+        columns = len(self.bands) + 6
         self._ring = np.zeros((2 * self._capacity, n, columns), dtype=np.float32)
         self._stamps = np.zeros(2 * self._capacity, dtype=np.int64)
         self._fill = 0
@@ -296,6 +315,7 @@ class GroupStream:
         out[:, :, b + 2] = same.reshape(shape).sum(axis=1)
         out[:, :, b + 3] = ~invalid
         out[:, :, b + 4] = holes
+        out[:, :, b + 5] = x.reshape(shape).mean(axis=1)
         stamps = self._pending_ns + self.dt_ns * (np.arange(n, dtype=np.int64) * d + (d - 1) // 2)
         self._append(out, stamps)
 
@@ -319,14 +339,19 @@ class GroupStream:
         """Bins made since the start of the stream."""
         return self.dropped_bins + self._fill
 
-    def frame(self, first_bin: int) -> tuple[int, Array, NDArray[np.bool_]]:
-        """Stamp after the frame (ns), energies (channels, bands) and validity of one frame."""
+    def frame(self, first_bin: int) -> Frame:
+        """What one decision frame holds."""
         start = first_bin - self.dropped_bins
         part = self._ring[start : start + FRAME]
+        mean = part.mean(axis=0, dtype=np.float64)
         b = len(self.bands)
-        valid = part[:, :, b + 3].mean(axis=0) > 0.7
-        end = int(self._stamps[start + FRAME - 1]) + round(self.step * 5e8)
-        return end, part[:, :, :b].mean(axis=0, dtype=np.float64), valid
+        return Frame(
+            end_ns=int(self._stamps[start + FRAME - 1]) + round(self.step * 5e8),
+            energy=mean[:, :b],
+            valid=mean[:, b + 3] > 0.7,
+            still=part[:, :, b + 2].min(axis=0) >= self.decimation,
+            mean=mean[:, b + 5],
+        )
 
     def window(self, channel: int, from_ns: int, to_ns: int) -> Window:
         """Features of one channel between two times, as far as the ring still holds them."""

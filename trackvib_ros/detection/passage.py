@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ class Hypothesis:
         wrong type leaves means of several centimetres where noise would average out.
         """
         gaps = np.round(np.diff(self.places, prepend=-99.0, append=self.places[-1] + 99.0), 1)
-        keys = [f"{a} {b}" for a, b in zip(gaps[:-1], gaps[1:], strict=True)]
+        keys = [f"{a} {b}" for a, b in pairwise(gaps)]
         good = self.fit.observed & (np.abs(self.fit.residual) < 0.5)
         square, chi2, total, within = 0.0, 0.0, 0, 0.0
         groups = []
@@ -438,7 +439,7 @@ def delay_speed(passage: Passage) -> tuple[float, float] | None:
     return speed, speed * float(np.hypot(sigma / mean, baseline))
 
 
-def _excited(record: Record, within: tuple[float, float]) -> bool:
+def excited(record: Record, within: tuple[float, float]) -> bool:
     """Whether a channel shows energy well above its floor in an interval, on enough valid bins."""
     inside = (record.window.time >= within[0]) & (record.window.time <= within[1])
     inside &= record.window.valid
@@ -456,7 +457,7 @@ def find_passages(
     truncated: bool = False,
 ) -> list[Passage]:
     """Every train in an event, in order of time: at the longest pauses, two are tried for one."""
-    rails = [r for r in records if r.channel.layer == "rail" and _excited(r, within)]
+    rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
     if not rails:
         return []
     whole = find_passage(rails, within, catalogue.types, limits, truncated)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .blind import Blind
 from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
-from .blind import Blind
+from .health import clipped
 from .kinematics import POSITION_SIGMA
 from .passage import CONFIRM_SCORE, Hypothesis, Passage, Record
 
@@ -85,7 +86,7 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
         inside = (window.time >= start) & (window.time <= stop)
         if record.channel.layer != "rail" or not inside.any():
             continue
-        if clipped(window.peak[inside], window.flat[inside]):
+        if clipped(window, inside):
             flags.add("clipped")
         if np.mean(window.holes[inside]) > 0.002 or not window.valid[inside].all():
             flags.add("gaps")
@@ -94,15 +95,6 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
         if window.time[-1] - stop < 0.15:
             flags.add("truncated_end")
     return sorted(flags)
-
-
-def clipped(peak: Array, flat: Array) -> bool:
-    """Whether samples pile up at the largest magnitude: equal neighbours there, not elsewhere."""
-    top = float(peak.max(initial=0.0))
-    if top <= 0:
-        return False
-    extreme = peak > 0.995 * top
-    return bool(extreme.sum() >= 5 and np.median(flat[extreme]) >= 1)
 
 
 def mixture(hypotheses: Sequence[Hypothesis]) -> tuple[float, float, float]:
