@@ -15,13 +15,15 @@ from numba import njit
 
 from .errors import InputError
 from .irregularity import Profile, build_profile
+from .line import assemble
 from .local import LocalField, LocalWheel, contact_stiffness, local_wheel, low_pass
 from .modal import ModalRun
-from .modes import ModalLine, modal_line
+from .modes import modal_line
 from .motion import TrainMotion
+from .newmark import NewmarkRun
 from .scenario import Scenario, Train
 from .traffic import Running, Traffic
-from .waves import Real, pinned_pinned_frequency
+from .waves import Real, pinned_pinned_frequency, rail_frequency
 
 MARGIN = 1.25
 """Least crossover per pinned-pinned frequency: that resonance is deterministic."""
@@ -31,6 +33,9 @@ LEAST_MARGIN = 1.1
 GLOBAL_MARGIN = 1.25
 """Frequency limit of the global set's modes per crossover: without the modes just above f_g the
 wheel force in the last third octave below it is 1 dB too large."""
+
+NEWMARK_PHASE = 0.346
+"""omega h at the crossover: Newmark's average acceleration lengthens periods there by 1 %."""
 
 SPEED_RANGE = 2 ** (1 / 6)
 """Largest ratio of the speeds of a train on the line: a sixth octave."""
@@ -46,13 +51,20 @@ per period of f_g a Kaiser window of beta 8 leaves -80 dB of them.
 def crossover_frequency(scenario: Scenario) -> float:
     """f_g (Hz): as stated, or the first third-octave edge above 1.25 pinned-pinned frequencies.
 
+    With ``solution.sines`` given it is what these resolve on the rail, as in the paper, even where
+    the pinned-pinned resonance then is left to the local set.
+
     Raises:
         InputError: the pinned-pinned resonance would be local, or nothing would be.
     """
     solution = scenario.solution
     pinned = pinned_pinned_frequency(scenario.track)
     chosen = solution.crossover
-    if chosen is None:
+    if chosen is None and solution.sines is not None:
+        line = scenario.line
+        longest = max(line.approach_left, *line.spans, line.approach_right)
+        chosen = rail_frequency(scenario.track, solution.sines[0] * math.pi / longest)
+    elif chosen is None:
         chosen = 10 ** (math.ceil(10 * math.log10(MARGIN * pinned) - 0.5) / 10 + 0.05)
     elif chosen < LEAST_MARGIN * pinned:
         raise InputError(
@@ -201,7 +213,6 @@ class HybridRun:
     Attributes:
         crossover: f_g (Hz).
         ratio: steps of the output per step of the global set.
-        line: modes of the global set.
         field: the local set.
     """
 
@@ -209,7 +220,11 @@ class HybridRun:
         self.scenario = scenario
         self.crossover = crossover_frequency(scenario)
         solution = scenario.solution
-        self.ratio = max(1, int(solution.frequency_limit / self.crossover + 1e-9))
+        newmark = solution.integrator == "newmark"
+        if newmark:
+            self.ratio = max(1, int(NEWMARK_PHASE / (2 * np.pi * self.crossover) / solution.step))
+        else:
+            self.ratio = max(1, int(solution.frequency_limit / self.crossover + 1e-9))
         coarse = solution.model_copy(
             update={
                 "model": "fe",
@@ -222,8 +237,11 @@ class HybridRun:
             self._check(train)
         self._fine = traffic
         self._traffic = GlobalTraffic(self._coarse_scenario, self.crossover)
-        self.line: ModalLine = modal_line(self._coarse_scenario)
-        self._run = ModalRun(self.line, self._traffic, derivatives)
+        self._run: ModalRun | NewmarkRun
+        if newmark:
+            self._run = NewmarkRun(assemble(self._coarse_scenario), self._traffic, derivatives)
+        else:
+            self._run = ModalRun(modal_line(self._coarse_scenario), self._traffic, derivatives)
         self.field = LocalField(scenario, self.crossover, derivatives)
         self._filters = interpolation_filters(self.ratio)
         self._channels = len(scenario.channel)
@@ -252,12 +270,23 @@ class HybridRun:
     def channel_band(self) -> Real:
         """(C,) valid band of every channel (Hz)."""
         limit = self.scenario.solution.frequency_limit
-        return np.where(self.field.heard, limit, self.line.channel_band)
+        return np.where(self.field.heard, limit, self._run.channel_band)
+
+    @property
+    def states(self) -> int:
+        """Number of modes or coordinates of the global set."""
+        return self._run.states
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on what limits the result."""
+        pinned = pinned_pinned_frequency(self.scenario.track)
+        warning = (
+            f"the stated solution.sines reach {self.crossover:.0f} Hz on the rail, so that its "
+            f"pinned-pinned resonance at {pinned:.0f} Hz is random instead of deterministic",
+        )
         return (
+            *(warning if self.crossover < pinned else ()),
             f"above {self.crossover:.0f} Hz motion is random with the energy of the power balance; "
             "single samples there are one of many possible outcomes",
             f"the global set is stepped at {self.ratio} steps of the output",

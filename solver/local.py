@@ -390,7 +390,7 @@ class LocalField:
     @property
     def frame(self) -> float:
         """Time step of the power balance (s)."""
-        return self.hop * self.step
+        return float(self.hop * self.step)
 
     def balance(self, cell: int) -> PowerBalance:
         """The power balance of one cell: rail, slab, support layer, either direction."""

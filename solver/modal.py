@@ -741,7 +741,7 @@ class ModalRun:
 
     @property
     def states(self) -> int:
-        """Number of modes that are stepped."""
+        """Number of modes of the line that are stepped."""
         return len(self.line.eigenvalues)
 
     @property

@@ -142,14 +142,9 @@ def plate_beam(plate: Plate, *beds: Bed) -> WaveBeam:
     )
 
 
-def pinned_pinned_frequency(track: Track) -> float:
-    """First pinned-pinned frequency of the rail between two fastenings (Hz).
-
-    The half wave pi/a of the free rail; exact for both beam theories, because a sine satisfies
-    the pinned ends.
-    """
-    rail = rail_beam(track)
-    q2 = (math.pi / track.fastening.spacing) ** 2
+def rail_frequency(track: Track, wavenumber: float) -> float:
+    """Frequency (Hz) at which the free rail has a wavenumber (rad/m), its first branch."""
+    rail, q2 = rail_beam(track), wavenumber**2
     ei, m = rail.bending_stiffness, rail.mass_per_length
     if math.isinf(rail.shear_stiffness):
         return math.sqrt(ei / m) * q2 / (2 * math.pi)
@@ -157,6 +152,15 @@ def pinned_pinned_frequency(track: Track) -> float:
     # m r w^4 - (m EI q^2 + g m + g r q^2) w^2 + g EI q^4 = 0
     a, b, c = m * r, m * ei * q2 + g * m + g * r * q2, g * ei * q2 * q2
     return math.sqrt((b - math.sqrt(b * b - 4 * a * c)) / (2 * a)) / (2 * math.pi)
+
+
+def pinned_pinned_frequency(track: Track) -> float:
+    """First pinned-pinned frequency of the rail between two fastenings (Hz).
+
+    The half wave pi/a of the free rail; exact for both beam theories, because a sine satisfies
+    the pinned ends.
+    """
+    return rail_frequency(track, math.pi / track.fastening.spacing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -413,7 +417,8 @@ class BlochSolution:
     def _power(self, wave: Complex) -> Real:
         """Power (twice the mean) that passes the start of the bay towards +x, (F,)."""
         velocity = 1j * self.omega[:, None] * wave[:, :2]
-        return -np.real(wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj())
+        passed = wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj()
+        return np.asarray(-passed.real)
 
     def _main_wave(self) -> tuple[NDArray[np.intp], Real]:
         """Which of the two right-going waves carries more, and its part of the input power, (F,).
