@@ -7,6 +7,7 @@ that share Jacobs bogies. Trains are lists of units; couplers carry no vertical 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ class Unit:
     wheelsets: NDArray[np.intp]
     wheel_radius: Array
 
-    @property
+    @cached_property
     def static_loads(self) -> Array:
         """(A,) N, wheelset forces at rest on a rigid flat track."""
         size = len(self.weight)
