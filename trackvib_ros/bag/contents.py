@@ -119,7 +119,7 @@ def _from_walk(path: Path) -> Contents:
         path,
         found.index.schemas,
         found.index.channels,
-        [chunk.index for chunk in found.index.chunks],
+        found.index.chunks,
         found.index.statistics(),
         found.records,
         gaps=found.gaps,

@@ -13,10 +13,12 @@ import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 
 import zstandard
-from mcap.data_stream import RecordBuilder
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
@@ -45,6 +47,8 @@ DEFINITIONS_EVERY = 32
 """Chunks after which schemas and channels are written again: a damaged chunk costs itself only."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
+_EMPTY_MESSAGE_INDEX = 1 + 8 + 2 + 4
+_NEVER = 2**63 - 1
 
 
 def encoded(record: McapRecord) -> bytes:
@@ -55,56 +59,89 @@ def encoded(record: McapRecord) -> bytes:
 
 
 @dataclass(slots=True)
-class IndexedChunk:
-    """A chunk in the file and how many messages of each channel it holds."""
-
-    index: ChunkIndex
-    counts: dict[int, int]
-
-
-@dataclass(slots=True)
 class FileIndex:
-    """What the summary section of one file says."""
+    """What the summary section of one file says.
+
+    The chunk indexes are kept as they will be written: a recording of weeks has millions of them.
+    """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[IndexedChunk] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    start: int = _NEVER
+    end: int = 0
+    _chunks: list[bytes] = field(default_factory=list)
+
+    @property
+    def chunk_count(self) -> int:
+        """Number of chunks."""
+        return len(self._chunks)
+
+    @property
+    def chunks(self) -> list[ChunkIndex]:
+        """All chunk indexes in file order."""
+        return [_chunk_index(record) for record in self._chunks]
+
+    def add_chunk(self, index: ChunkIndex, counts: Mapping[int, int]) -> None:
+        """Append a chunk that holds so many messages of each channel."""
+        self._chunks.append(encoded(index))
+        self.start = min(self.start, index.message_start_time)
+        self.end = max(self.end, index.message_end_time)
+        for channel, count in counts.items():
+            self.counts[channel] = self.counts.get(channel, 0) + count
+
+    def drop_last_chunk(self) -> tuple[ChunkIndex, dict[int, int]]:
+        """Forget the last chunk; return it and how many messages of each channel it holds."""
+        last = _chunk_index(self._chunks.pop())
+        offsets = [
+            *last.message_index_offsets.values(),
+            last.chunk_start_offset + last.chunk_length + last.message_index_length,
+        ]
+        lengths = [after - before for before, after in pairwise(offsets)]
+        counts = {
+            channel: (length - _EMPTY_MESSAGE_INDEX) // 16
+            for channel, length in zip(last.message_index_offsets, lengths, strict=True)
+        }
+        for channel, count in counts.items():
+            self.counts[channel] -= count
+            if not self.counts[channel]:
+                del self.counts[channel]
+        chunks = self.chunks
+        self.start = min((c.message_start_time for c in chunks), default=_NEVER)
+        self.end = max((c.message_end_time for c in chunks), default=0)
+        return last, counts
 
     def statistics(self) -> Statistics:
         """Return the totals over all chunks."""
-        counts: dict[int, int] = {}
-        for chunk in self.chunks:
-            for channel, count in chunk.counts.items():
-                counts[channel] = counts.get(channel, 0) + count
         return Statistics(
             attachment_count=0,
             channel_count=len(self.channels),
-            channel_message_counts=counts,
-            chunk_count=len(self.chunks),
-            message_count=sum(counts.values()),
-            message_end_time=max((c.index.message_end_time for c in self.chunks), default=0),
-            message_start_time=min((c.index.message_start_time for c in self.chunks), default=0),
+            channel_message_counts=dict(self.counts),
+            chunk_count=len(self._chunks),
+            message_count=sum(self.counts.values()),
+            message_end_time=self.end,
+            message_start_time=0 if self.start == _NEVER else self.start,
             metadata_count=len(self.metadata),
             schema_count=len(self.schemas),
         )
 
     def summary(self, start: int) -> bytes:
         """Return the summary section, footer and closing magic for a summary at ``start``."""
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self.schemas.values())),
-            (Opcode.CHANNEL, list(self.channels.values())),
-            (Opcode.STATISTICS, [self.statistics()]),
-            (Opcode.CHUNK_INDEX, [chunk.index for chunk in self.chunks]),
-            (Opcode.METADATA_INDEX, list(self.metadata)),
-        ]
+        groups = (
+            (Opcode.SCHEMA, [encoded(schema) for schema in self.schemas.values()]),
+            (Opcode.CHANNEL, [encoded(channel) for channel in self.channels.values()]),
+            (Opcode.STATISTICS, [encoded(self.statistics())]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.METADATA_INDEX, [encoded(index) for index in self.metadata]),
+        )
         body = RecordBuilder()
         offsets: list[SummaryOffset] = []
         for opcode, records in groups:
             if records:
                 group_start = body.count
                 for record in records:
-                    record.write(body)
+                    body.write(record)
                 offsets.append(SummaryOffset(opcode, start + group_start, body.count - group_start))
         offset_start = start + body.count
         for offset in offsets:
@@ -119,12 +156,16 @@ class FileIndex:
 class _OpenChunk:
     records: bytearray = field(default_factory=bytearray)
     entries: dict[int, list[int]] = field(default_factory=dict)
-    start: int = 2**63 - 1
+    start: int = _NEVER
     end: int = 0
 
     @property
     def counts(self) -> dict[int, int]:
         return {channel: len(entries) // 2 for channel, entries in self.entries.items()}
+
+
+def _chunk_index(record: bytes) -> ChunkIndex:
+    return ChunkIndex.read(ReadDataStream(BytesIO(record[9:])))
 
 
 def message_index(channel: int, entries: list[int]) -> bytes:
@@ -239,9 +280,9 @@ class McapFile:
             uncompressed_size=len(raw),
         )
         self._append(body + indexes)
-        self.index.chunks.append(IndexedChunk(index, chunk.counts))
+        self.index.add_chunk(index, chunk.counts)
         self._open = _OpenChunk()
-        if len(self.index.chunks) % DEFINITIONS_EVERY == 0:
+        if self.index.chunk_count % DEFINITIONS_EVERY == 0:
             self._defined.clear()
 
     def discard(self) -> dict[int, int]:
@@ -285,12 +326,12 @@ class McapFile:
             except OSError:
                 self._end, self._crc, self.index.metadata = end, crc, metadata
                 self._cut()
-                if not give_up or not self.index.chunks:
+                if not give_up or not self.index.chunk_count:
                     raise
-                last = self.index.chunks.pop()
-                for channel, count in last.counts.items():
+                last, counts = self.index.drop_last_chunk()
+                for channel, count in counts.items():
                     given_up[channel] = given_up.get(channel, 0) + count
-                self._end = last.index.chunk_start_offset
+                self._end = last.chunk_start_offset
                 self._cut()
                 self._crc = self._crc_of_file()
         return given_up

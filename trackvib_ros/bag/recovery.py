@@ -182,7 +182,7 @@ def _cut_and_finish(path: Path, found: Scan) -> None:
 
 def _cut_is_enough(found: Scan) -> bool:
     return found.clean_end > len(MAGIC) and all(
-        chunk.index.chunk_start_offset < found.clean_end for chunk in found.index.chunks
+        chunk.chunk_start_offset < found.clean_end for chunk in found.index.chunks
     )
 
 

@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Header, Metadata, MetadataIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-from trackvib_ros.bag.mcap_file import MAGIC, FileIndex, IndexedChunk, encoded, message_index
+from trackvib_ros.bag.mcap_file import MAGIC, FileIndex, encoded, message_index
 
 _ZSTD_CHUNK = struct.pack("<I", 4) + b"zstd"
 _BEFORE_COMPRESSION = 9 + 8 + 8 + 8 + 4
@@ -223,7 +223,7 @@ def _add_chunk(result: Scan, found: Record) -> bytes:
         uncompressed_size=chunk.uncompressed_size,
     )
     counts = {channel: len(numbers) // 2 for channel, numbers in entries.items()}
-    result.index.chunks.append(IndexedChunk(index, counts))
+    result.index.add_chunk(index, counts)
     return bytes(indexes)
 
 

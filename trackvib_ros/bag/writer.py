@@ -267,7 +267,7 @@ class BagWriter:
             return
         self._file.flush()
         self._dirty.set()
-        chunks = len(self._file.index.chunks)
+        chunks = self._file.index.chunk_count
         needed = chunks * (_EMPTY_CHUNK_INDEX + 10 * len(self._topics)) + sum(
             len(topic.definition) + 2048 for topic in self._topics.values()
         )
