@@ -42,7 +42,6 @@ class AxleFit:
     contrast: Array
     observed: NDArray[np.bool_]
     offset: Array
-    prior_cost: float
     anchor_sigma: Array
 
     @property
@@ -222,5 +221,4 @@ def fit_axles(
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
         anchor_sigma=anchor_sigma,
-        prior_cost=fit.prior_cost if fit is not None else float("inf"),
     )

@@ -91,7 +91,6 @@ class Fit:
         scale: standard deviation of the residuals (m).
         weight: 0 to 1 per point.
         offset: of every channel (m).
-        prior_cost: squared distance of the solution from its priors, in standard deviations.
     """
 
     motion: Motion
@@ -99,7 +98,6 @@ class Fit:
     scale: float
     weight: Array
     offset: Array
-    prior_cost: float
 
 
 def robust_scale(residual: Array, parameters: int) -> float:
@@ -157,5 +155,4 @@ def regress(
     motion = Motion(epoch, float(solution[0]), float(solution[1]), float(solution[2]), covariance)
     offset = np.zeros(channel.max() + 1)
     offset[groups] = solution[3:]
-    cost = float(np.sum((solution[2:] / sigmas[2:]) ** 2))
-    return Fit(motion, residual, scale, weight, offset, cost)
+    return Fit(motion, residual, scale, weight, offset)

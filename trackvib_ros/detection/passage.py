@@ -32,7 +32,8 @@ HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
 
 _POSTERIOR_TEMPER = 0.5  # all wheelsets meet the same rail: their residuals are not independent
-_MODEL_SIGMA = 0.03  # m, systematic residuals of a right type (bogies nod, pulses overlap)
+_OFFSET_COST = 12.0  # most that the place of a channel may count against a type
+_MODEL_SIGMA = 0.04  # m, systematic residuals of a right type (bogies nod, pulses overlap)
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
 _MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
@@ -397,11 +398,15 @@ def ranked(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         residual = np.clip(h.fit.residual[h.fit.observed], -0.4, 0.4)
         spreads.append(float(np.sqrt(np.mean(residual**2) + _MODEL_SIGMA**2)))
     least = min(spreads)
+    # the clearest of the fits tells how well the pulses give the places of the channels
+    anchor = min(float(h.fit.anchor_sigma.max()) for h in hypotheses)
+    place = 2**0.5 * float(np.hypot(POSITION_SIGMA, anchor))
     top = max(h.score for h in hypotheses)
     logs = []
     for h, spread in zip(hypotheses, spreads, strict=True):
         count = int(h.fit.observed.sum())
-        log = -_POSTERIOR_TEMPER * count * np.log(spread / least) - 0.5 * h.fit.prior_cost
+        log = -_POSTERIOR_TEMPER * count * np.log(spread / least)
+        log -= 0.5 * min(float(np.sum((h.fit.offset / place) ** 2)), _OFFSET_COST)
         logs.append(log - _SCORE_WEIGHT * max(0.0, top - h.score - _SCORE_NOISE))
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
