@@ -149,8 +149,9 @@ class BagWriter:
                 )
             return
         with self._lock:
+            # A new dictionary: the writer's thread may be walking over the old one.
             self._numbers[topic.name] = len(self._topics) + 1
-            self._topics[topic.name] = topic
+            self._topics = {**self._topics, topic.name: topic}
 
     def write(self, topic: str, log_time_ns: int, publish_time_ns: int, data: bytes) -> bool:
         """Queue one serialized message; return False (and count a drop) if it was refused.
@@ -204,9 +205,10 @@ class BagWriter:
             self._wake.wait(_TICK_S)
             self._wake.clear()
             with self._lock:
-                stopping = self._stopping
-                batch, self._queue = self._queue, deque()
-                self._queued = 0
+                batch = self._next_batch()
+                stopping = self._stopping and not self._queue
+                if self._queue:
+                    self._wake.set()
                 custom_data = self._custom_data if self._custom_data_pending else None
                 self._custom_data_pending = False
             try:
@@ -229,6 +231,16 @@ class BagWriter:
             except Exception as failure:
                 self._stop_recording(failure, batch)
                 return
+
+    def _next_batch(self) -> deque[tuple[str, int, int, bytes]]:
+        """Take about a chunk, so that the queue's bound is the bound of all that waits."""
+        batch: deque[tuple[str, int, int, bytes]] = deque()
+        size = 0
+        while self._queue and size < CHUNK_BYTES:
+            batch.append(self._queue.popleft())
+            size += len(batch[-1][3])
+        self._queued -= size
+        return batch
 
     def _add(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
         file = self._file
