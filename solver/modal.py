@@ -10,9 +10,9 @@ q the stepper keeps y, with q = y + a p - (c/E) p', which needs no memory of p:
 
     y_next = E y + d p,   d = E a + b + c/E.
 
-The displacement of the rail at a wheelset is then a sum over the modes of y, known before the
-force, plus tabled compliances times the own new and last force. Compliances between different
-wheelsets within one step are left out: waves travel less than 0.2 m in 25 us.
+The displacement of the rail at a wheelset is a sum over the modes of q, predicted with the last
+forces at the new positions, plus its own tabled compliance times the change of its force. The
+changes of the other forces in the same step are left out: they are second order in the step.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ class ModalTables:
     Attributes:
         shapes: (cells, 8, K) re and im of the four cubic coefficients of the rail shapes.
         decay, drive: (2, K) re and im of E and d.
-        compliance: (2, cells, 4) m/N, cubic coefficients: rail displacement at a wheelset per its
-            new and its last force, residual compliance in the former.
+        predict: (4, K) re and im of a and of -c/E.
+        compliance: (2, cells, 4) m/N, cubic coefficients: displacement of the modes at a wheelset
+            per its new force; residual compliance.
         channel_weights: (O, 2K) output = channel_weights @ (re, -im of y) + feed-through.
         channel_feed: (2, cells, 4, O) cubic coefficients of the feed-through per new, last force.
         start_weights: (2, K) complex: y before sample 0 = start_weights[0] p for a static p.
@@ -94,6 +95,7 @@ class ModalTables:
     shapes: NDArray[np.floating]
     decay: Array
     drive: Array
+    predict: Array
     compliance: Array
     channel_weights: Array
     channel_feed: Array
@@ -145,13 +147,8 @@ def modal_tables(
 
     ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
     slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
-    compliance = np.empty((2, cells, 4))
-    for row, factor in enumerate((now, recall)):
-        (v0, v1), (d0, d1) = (ends**2 @ factor).real, (2 * ends * slopes @ factor).real
-        compliance[row] = np.stack(
-            [v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1
-        )
-    compliance[0] += line.residual
+    (v0, v1), (d0, d1) = (ends**2 @ now).real, (2 * ends * slopes @ now).real
+    own = np.stack([v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1)
 
     channel = line.channel_shapes * root
     weights, feeds = [], []
@@ -176,7 +173,8 @@ def modal_tables(
         shapes=packed,
         decay=split(decay),
         drive=split(decay * now + last - recall),
-        compliance=compliance,
+        predict=np.concatenate([split(now), split(recall)]),
+        compliance=np.stack([own, line.residual]),
         channel_weights=channel_weights,
         channel_feed=channel_feed,
         start_weights=start,
@@ -274,6 +272,7 @@ def build_fleet(
 def march(
     tables: ModalTables,
     modal: Array,
+    load: Array,
     fleet: Fleet,
     position: Array,
     roughness: Array,
@@ -285,6 +284,7 @@ def march(
     Args:
         tables: of the line.
         modal: (2K,) re and -im of the state y, overwritten.
+        load: (2K,) re and im of p at the last sample, overwritten.
         fleet: units on or near the line; their state is overwritten.
         position: (n, W) m of the fleet's axles.
         roughness: (n, W) m, irregularity plus wheel defects under them.
@@ -299,6 +299,7 @@ def march(
         tables.shapes.reshape(len(tables.shapes), -1),
         tables.decay,
         tables.drive,
+        tables.predict,
         tables.compliance,
         tables.channel_weights,
         tables.channel_feed,
@@ -306,8 +307,9 @@ def march(
         tables.grid_step,
         tables.length,
         modal,
+        load,
         np.empty((axles, width), dtype=tables.shapes.dtype),
-        np.empty(width),
+        np.empty((2, width)),
         np.empty((len(position), width)),
         fleet.kind,
         fleet.first,
@@ -340,14 +342,10 @@ KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
 # Slices, not offsets, in the innermost loops: indices that might be negative are not vectorised.
 @njit(**KERNEL)
-def _shape_at(c0, c1, c2, c3, s, shape, modal):  # type: ignore[no-untyped-def]
-    """Rail shapes at s in a cell, re and im in a row, and their scalar product with the modes."""
-    total = 0.0
+def _shape_at(c0, c1, c2, c3, s, shape):  # type: ignore[no-untyped-def]
+    """Rail shapes at s in a cell, re and im in a row."""
     for k in range(shape.size):
-        value = c0[k] + s * (c1[k] + s * (c2[k] + s * c3[k]))
-        shape[k] = value
-        total += value * modal[k]
-    return total
+        shape[k] = c0[k] + s * (c1[k] + s * (c2[k] + s * c3[k]))
 
 
 @njit(**KERNEL)
@@ -371,6 +369,33 @@ def _step_modes(  # type: ignore[no-untyped-def]
         x, y, p, q = re[k], im[k], load_re[k], load_im[k]
         re[k] = decay_re[k] * x + decay_im[k] * y + drive_re[k] * p - drive_im[k] * q
         im[k] = decay_re[k] * y - decay_im[k] * x - drive_re[k] * q - drive_im[k] * p
+
+
+@njit(**KERNEL)
+def _sum_loads(shape, pushing, pushed, force, load):  # type: ignore[no-untyped-def]
+    """Sum of shapes times forces over the wheelsets that push."""
+    load[:] = 0.0
+    m = 0
+    while m + 3 < pushed:
+        a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
+        _add_four(
+            shape[a], shape[b], shape[c], shape[d], force[a], force[b], force[c], force[d], load
+        )
+        m += 4
+    while m < pushed:
+        _add_one(shape[pushing[m]], force[pushing[m]], load)
+        m += 1
+
+
+@njit(**KERNEL)
+def _predict(  # type: ignore[no-untyped-def]
+    now_re, now_im, last_re, last_im, guess_re, guess_im, load_re, load_im, re, im, out_re, out_im
+):
+    """q = y + a p - (c/E) p' with p guessed; out_im holds -im of q."""
+    for k in range(re.size):
+        p, q, r, s = guess_re[k], guess_im[k], load_re[k], load_im[k]
+        out_re[k] = re[k] + now_re[k] * p - now_im[k] * q + last_re[k] * r - last_im[k] * s
+        out_im[k] = im[k] - now_re[k] * q - now_im[k] * p - last_re[k] * s - last_im[k] * r
 
 
 @njit(**KERNEL)
@@ -428,6 +453,7 @@ def _march(  # type: ignore[no-untyped-def]
     shapes,
     decay,
     drive,
+    predict,
     compliance,
     channel_weights,
     channel_feed,
@@ -435,8 +461,9 @@ def _march(  # type: ignore[no-untyped-def]
     grid_step,
     length,
     modal,
-    shape,
     load,
+    shape,
+    spare,
     history,
     kind,
     first,
@@ -470,8 +497,40 @@ def _march(  # type: ignore[no-untyped-def]
     for n in range(position.shape[0]):
         history[n] = modal
         outputs[n] = 0.0
-        load[:] = 0.0
         pushed = 0
+        for i in range(position.shape[1]):
+            x = position[n, i]
+            if 0.0 <= x <= length:
+                at = (x - grid_start) / grid_step
+                cell = min(int(at), last_cell)
+                c = shapes[cell]
+                _shape_at(
+                    c[:width],
+                    c[width : 2 * width],
+                    c[2 * width : 3 * width],
+                    c[3 * width :],
+                    shapes.dtype.type(at - cell),
+                    shape[i],
+                )
+                pushing[pushed] = i
+                pushed += 1
+        if pushed > 0:
+            guess, predicted = spare[0], spare[1]
+            _sum_loads(shape, pushing, pushed, last_force, guess)
+            _predict(
+                predict[0],
+                predict[1],
+                predict[2],
+                predict[3],
+                guess[:size],
+                guess[size:],
+                load[:size],
+                load[size:],
+                modal[:size],
+                modal[size:],
+                predicted[:size],
+                predicted[size:],
+            )
         for u in range(kind.size):
             t = kind[u]
             begin = first[u]
@@ -479,7 +538,6 @@ def _march(  # type: ignore[no-untyped-def]
             for a in range(count):
                 i = begin + a
                 x, old = position[n, i], last_place[i]
-                was_on = 0.0 <= old <= length
                 own[i] = -now[t, a, a]
                 gap[i] = state[u, wheelsets[t, a]] - roughness[n, i]
                 for b in range(count):
@@ -488,7 +546,7 @@ def _march(  # type: ignore[no-untyped-def]
                         gap[i] += now[t, a, b] * force[n, begin + b]
                     elif b > a:
                         gap[i] += now[t, a, b] * last_force[begin + b]
-                if was_on and outputs.shape[1] > 0:
+                if 0.0 <= old <= length and outputs.shape[1] > 0:
                     at = (old - grid_start) / grid_step
                     cell = min(int(at), last_cell)
                     _feed(channel_feed[1, cell], at - cell, last_force[i], outputs[n])
@@ -498,26 +556,12 @@ def _march(  # type: ignore[no-untyped-def]
                 at = (x - grid_start) / grid_step
                 cell = min(int(at), last_cell)
                 s = at - cell
-                c = shapes[cell]
-                gap[i] -= _shape_at(
-                    c[:width],
-                    c[width : 2 * width],
-                    c[2 * width : 3 * width],
-                    c[3 * width :],
-                    shapes.dtype.type(s),
-                    shape[i],
-                    modal,
-                )
-                own[i] += _cubic(compliance[0, cell], s)
-                if was_on:
-                    at = (0.5 * (x + old) - grid_start) / grid_step
-                    middle = min(int(at), last_cell)
-                    gap[i] -= last_force[i] * _cubic(compliance[1, middle], at - middle)
+                modes = _cubic(compliance[0, cell], s)
+                gap[i] += modes * last_force[i] - _dot(shape[i], spare[1])
+                own[i] += modes + _cubic(compliance[1, cell], s)
                 f = solve_contact(gap[i], own[i], linear[i], hertz[i])
                 force[n, i] = f
                 _feed(channel_feed[0, cell], s, f, outputs[n])
-                pushing[pushed] = i
-                pushed += 1
             for a in range(count):
                 i = begin + a
                 f = force[n, i]
@@ -543,24 +587,7 @@ def _march(  # type: ignore[no-untyped-def]
                     touching[i] = force[n, i] > 0.0
                 else:
                     force[n, i] = np.nan
-        m = 0
-        while m + 3 < pushed:
-            p, q, r, v = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
-            _add_four(
-                shape[p],
-                shape[q],
-                shape[r],
-                shape[v],
-                force[n, p],
-                force[n, q],
-                force[n, r],
-                force[n, v],
-                load,
-            )
-            m += 4
-        while m < pushed:
-            _add_one(shape[pushing[m]], force[n, pushing[m]], load)
-            m += 1
+        _sum_loads(shape, pushing, pushed, last_force, load)
         _step_modes(
             decay[0],
             decay[1],
@@ -578,6 +605,7 @@ def _march(  # type: ignore[no-untyped-def]
 def march_reference(
     tables: ModalTables,
     modal: Array,
+    load: Array,
     fleet: Fleet,
     position: Array,
     roughness: Array,
@@ -588,6 +616,9 @@ def march_reference(
     size = tables.size
     decay = tables.decay[0] + 1j * tables.decay[1]
     drive = tables.drive[0] + 1j * tables.drive[1]
+    now_weight = tables.predict[0] + 1j * tables.predict[1]
+    last_weight = tables.predict[2] + 1j * tables.predict[3]
+    p = load[:size] + 1j * load[size:]
     lost, worst = 0, 0.0
 
     def locate(x: float) -> tuple[int, Array]:
@@ -595,10 +626,18 @@ def march_reference(
         cell = min(int(at), len(tables.shapes) - 1)
         return cell, np.asarray((at - cell) ** np.arange(4), np.float64)
 
+    def shape_at(x: float) -> Complex:
+        cell, powers = locate(x)
+        coefficients = tables.shapes[cell].reshape(4, 2, size).astype(np.float64)
+        return np.asarray(powers @ coefficients[:, 0] + 1j * (powers @ coefficients[:, 1]))
+
     for n in range(len(position)):
         y = modal[:size] - 1j * modal[size:]
         outputs[n] = tables.channel_weights @ modal
-        load = np.zeros(size, dtype=np.complex128)
+        shapes = {i: shape_at(x) for i, x in enumerate(position[n]) if 0 <= x <= tables.length}
+        guess = sum((fleet.force[i] * shape for i, shape in shapes.items()), np.zeros(size))
+        q = y + now_weight * guess + last_weight * p
+        p = np.zeros(size, dtype=np.complex128)
         for u, t in enumerate(fleet.kind):
             axles = slice(fleet.first[u], fleet.first[u + 1])
             count = axles.stop - axles.start
@@ -609,28 +648,25 @@ def march_reference(
             new = np.zeros(count)
             gaps, compliances = np.zeros(count), np.zeros(count)
             for a in range(count):
-                guess = np.where(np.arange(count) < a, new, last)
-                guess[a] = 0.0
+                known = np.where(np.arange(count) < a, new, last)
+                known[a] = 0.0
                 gap = fleet.state[u, fleet.wheelsets[t, a]] - roughness[n, axles][a]
-                gap += before[a] @ last + now[a] @ guess
+                gap += before[a] @ last + now[a] @ known
                 own = -now[a, a]
                 if was_on[a]:
                     cell, powers = locate(fleet.place[axles][a])
                     outputs[n] += last[a] * (powers @ tables.channel_feed[1, cell])
                 if on[a]:
                     cell, powers = locate(x[a])
-                    coefficients = tables.shapes[cell].reshape(4, 2, size).astype(np.float64)
-                    shape = powers @ coefficients[:, 0] + 1j * (powers @ coefficients[:, 1])
-                    gap -= (shape * y).real.sum()
-                    own += powers @ tables.compliance[0, cell]
-                    if was_on[a]:
-                        middle, half = locate((x[a] + fleet.place[axles][a]) / 2)
-                        gap -= last[a] * (half @ tables.compliance[1, middle])
+                    shape = shapes[axles.start + a]
+                    modes, rest = (powers @ tables.compliance[i, cell] for i in range(2))
+                    gap += modes * last[a] - (shape * q).real.sum()
+                    own += modes + rest
                 law = fleet.linear[axles][a], fleet.hertz[axles][a]
                 new[a] = solve_contact(gap, own, *law)
                 gaps[a], compliances[a] = gap, own
                 if on[a]:
-                    load += shape * new[a]
+                    p += shape * new[a]
                     outputs[n] += new[a] * (powers @ tables.channel_feed[0, cell])
             later: Array = np.triu(now, 1) @ (new - last)
             for a in range(count):
@@ -648,8 +684,9 @@ def march_reference(
             fleet.touching[axles] = np.where(on, new > 0, fleet.touching[axles])
             fleet.force[axles], fleet.place[axles] = new, x
             force[n, axles] = np.where(on, new, np.nan)
-        y = decay * y + drive * load
+        y = decay * y + drive * p
         modal[:size], modal[size:] = y.real, -y.imag
+        load[:size], load[size:] = p.real, p.imag
     return lost, float(worst)
 
 
@@ -726,6 +763,7 @@ class ModalRun:
         self._next = 0
         self._held: list[Array] = []
         self._modal: Array = np.zeros(2 * self.tables.size)
+        self._load: Array = np.zeros(2 * self.tables.size)
         self._units: list[Running] = []
         self._loads: Array = np.zeros(0)
         self._fleet: Fleet | None = None
@@ -839,7 +877,7 @@ class ModalRun:
         roughness = self.traffic.roughness(self._units, place, time)
         own_force = np.empty(place.shape)
         lost, residual = self._march(
-            self.tables, self._modal, self._fleet, place, roughness, own_force, outputs
+            self.tables, self._modal, self._load, self._fleet, place, roughness, own_force, outputs
         )
         force[:, columns] = own_force
         _dropped_answer(
@@ -927,6 +965,8 @@ class ModalRun:
         if on_line.any():
             load = (shapes * np.sqrt(weights)).T @ force
             y = self.tables.start_weights[: len(load)] * load
+            self._load[: len(load)] += load.real
+            self._load[self.tables.size : self.tables.size + len(load)] += load.imag
             self._modal[: len(load)] += y.real
             self._modal[self.tables.size : self.tables.size + len(load)] -= y.imag
         states, forces, first, axle = [], [], 0, 0

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .contact import compression_of, wheelset_law
 from .errors import InputError
 from .hybrid import HybridRun
 from .line import assemble
@@ -20,10 +21,14 @@ from .newmark import NewmarkRun
 from .quality import QualityReport
 from .scenario import Scenario, Train
 from .traffic import Traffic
+from .vehicle import build_units
 
 Array = NDArray[np.float64]
 Output = Literal["displacement", "velocity", "acceleration"]
 OUTPUTS: tuple[Output, ...] = ("displacement", "velocity", "acceleration")
+
+CONTACT_PHASE = 0.5
+"""Largest phase (rad) of a wheelset on its contact springs in one step."""
 
 SETTLE_TIME = 3.0
 """Time (s) that a run of unstated end goes on after the last wheelset has left the line."""
@@ -87,6 +92,8 @@ class Simulation:
         self._traffic = Traffic(scenario)
         self._index = 0
         _check_step(scenario)
+        for train in scenario.train:
+            _check_contact(scenario, train)
         derivatives = tuple(OUTPUTS.index(name) for name in self._outputs)
         tell("modes of the line: computed once, then kept")
         self._run: ModalRun | HybridRun | NewmarkRun
@@ -176,6 +183,7 @@ class Simulation:
             InputError: a wheelset would appear on the line out of nowhere.
         """
         train = train.model_copy(update={"start_time": start_time})
+        _check_contact(self.scenario, train)
         now = self._run.next_sample * self.step_ns * 1e-9
         place = TrainMotion(train).position(now)
         if (
@@ -201,3 +209,21 @@ def _check_step(scenario: Scenario) -> None:
             f"solution.step = {step:g} s is too long for solution.frequency_limit = {limit:g} Hz: "
             f"at most 1/(2 frequency_limit) = {0.5 / limit:.3g} s"
         )
+
+
+def _check_contact(scenario: Scenario, train: Train) -> None:
+    """Refuse a step that does not resolve a wheelset on its contact springs."""
+    step = scenario.solution.step
+    for unit in build_units(train):
+        masses = unit.mass[unit.wheelsets, unit.wheelsets]
+        for load, mass, radius in zip(unit.static_loads, masses, unit.wheel_radius, strict=True):
+            law = np.array(wheelset_law(scenario.contact, float(radius)))[:, np.newaxis]
+            compression = float(compression_of(np.array([load]), *law)[0])
+            stiffness = load / compression * (1.5 if scenario.contact.law == "hertz" else 1.0)
+            angular = math.sqrt(stiffness / mass)
+            if angular * step > CONTACT_PHASE:
+                raise InputError(
+                    f"solution.step = {step:g} s is too long: a wheelset of {mass:g} kg resonates "
+                    f"on its contact at {angular / (2 * math.pi):.0f} Hz; at most "
+                    f"{CONTACT_PHASE / angular:.3g} s"
+                )
