@@ -16,6 +16,7 @@ from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .features import FRAME, GroupStream
 from .health import HealthBook, clipped
+from .live import provisional
 from .onset import Trigger
 from .passage import Passage, Record, excited, find_passages
 
@@ -27,6 +28,8 @@ _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
 _RISE = 10.0  # a train on rails that still ring
 _FADED = 1 / 100  # of the strongest level of an event: what is left is no train
+_UPDATE_NS = 200_000_000
+_UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
@@ -79,6 +82,8 @@ class _Event:
     last_ns: dict[int, int]
     strongest: dict[int, float]
     truncated: bool = False
+    next_update_ns: int = 0
+    updates: int = 0
 
 
 class TrainDetector:
@@ -242,6 +247,7 @@ class TrainDetector:
                 delay = group.stream.shift[group.trigger.band[local]]
                 start = now_ns - round((FRAME * group.stream.step + delay) * 1e9)
                 self._event = _Event(start, set(), {}, {})
+                self._event.next_update_ns = now_ns + _UPDATE_NS
                 ratio = float(group.trigger.ratio[local])
                 events.append(report.arrival(self.channels[channel], start, ratio))
             self._active_ns[channel] = now_ns
@@ -265,6 +271,8 @@ class TrainDetector:
             for other in self._groups.values():
                 for local in range(len(other.index)):
                     other.trigger.relearn(local)
+        elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
+            events += self._update(self._event, now_ns)
         return events
 
     def _fresh(self, channel: int, level: float, now_ns: int) -> bool:
@@ -287,14 +295,7 @@ class TrainDetector:
         self._event = None
         self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
-        records = []
-        for group in self._groups.values():
-            for local, channel in enumerate(group.index):
-                window = group.stream.window(local, origin, now_ns)
-                if window.time.size > 50 and np.isfinite(group.trigger.floor[local]).all():
-                    records.append(
-                        Record(self.channels[channel], window, group.trigger.floor[local].copy())
-                    )
+        records = self._records(origin, now_ns)
         last = self._deciding_last(event)
         within = (
             (event.start_ns - origin) * 1e-9 - 0.5,
@@ -309,6 +310,28 @@ class TrainDetector:
             swapped = []
         events = self._passage_health(now_ns, records, within, found, swapped)
         return events + report.closing(self.catalogue, records, origin, within, found, flags)
+
+    def _records(self, from_ns: int, to_ns: int) -> list[Record]:
+        records = []
+        for group in self._groups.values():
+            for local, channel in enumerate(group.index):
+                window = group.stream.window(local, from_ns, to_ns)
+                if window.time.size > 50 and np.isfinite(group.trigger.floor[local]).all():
+                    records.append(
+                        Record(self.channels[channel], window, group.trigger.floor[local].copy())
+                    )
+        return records
+
+    def _update(self, event: _Event, now_ns: int) -> list[TrainEvent]:
+        event.next_update_ns = now_ns + _UPDATE_NS
+        origin = event.start_ns - _BEFORE_NS
+        within = ((event.start_ns - origin) * 1e-9 - 0.5, (now_ns - origin) * 1e-9)
+        limits = (self.config.min_speed, self.config.max_speed)
+        found = provisional(self._records(origin, now_ns), within, limits)
+        if found is None or found.distance < _UPDATE_AFTER[event.updates]:
+            return []
+        event.updates += 1
+        return [report.update(found, now_ns)]
 
     def _try_swapped(
         self,

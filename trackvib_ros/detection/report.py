@@ -12,6 +12,7 @@ from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
 from .health import clipped
 from .kinematics import POSITION_SIGMA
+from .live import Provisional
 from .passage import CONFIRM_SCORE, Hypothesis, Passage, Record
 
 Array = NDArray[np.float64]
@@ -33,6 +34,24 @@ def arrival(channel: Channel, stamp_ns: int, ratio: float) -> TrainEvent:
         method="energy over noise floor",
         sensors=(channel.name,),
         values={"grade": VIBRATION, "reference_x": Estimate(channel.x, 0.0, "m")},
+    )
+
+
+def update(found: Provisional, now_ns: int) -> TrainEvent:
+    """A provisional speed while the train passes."""
+    return TrainEvent(
+        kind="update",
+        stamp_ns=now_ns,
+        sigma_s=0.0,
+        confidence=float(np.clip(found.correlation, 0.0, 0.95)),
+        method="delay of the envelope between two rail channels",
+        sensors=found.sensors,
+        values={
+            "speed": Estimate(found.speed, found.sigma, "m/s"),
+            "direction": _DIRECTION[found.direction],
+            "passed": Estimate(found.distance, 2.0, "m"),
+        },
+        quality=("provisional",),
     )
 
 
