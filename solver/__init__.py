@@ -17,6 +17,9 @@ from .scenario import (
     train_preset,
 )
 from .simulation import Block, Simulation
+from .statistics import wavelength_classes
+from .validation import compare_models, ensemble_study
+from .waves import pinned_pinned_frequency, rail_frequency
 
 __all__ = [
     "GRAVITY",
@@ -31,10 +34,15 @@ __all__ = [
     "TrainMotion",
     "build_scenario",
     "check_run",
+    "compare_models",
+    "ensemble_study",
     "load_scenario",
     "load_scenario_text",
+    "pinned_pinned_frequency",
     "preset_names",
     "preset_text",
+    "rail_frequency",
     "scenario_schema",
     "train_preset",
+    "wavelength_classes",
 ]

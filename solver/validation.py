@@ -284,6 +284,7 @@ class Comparison:
 
     Attributes:
         crossover: f_g (Hz).
+        centres: (B,) Hz. distances: (D,) m.
         level: (seeds, B) dB, rail acceleration over the passage, mean of the channels.
         mean_level: (B,) dB of the seed means. layers: {layer: (B,) dB of the seed means}.
         envelope: (D, B) dB of the seed means. spread: (D, B) dB, standard error of ``envelope``.
@@ -293,6 +294,8 @@ class Comparison:
     """
 
     crossover: float
+    centres: Real
+    distances: Real
     level: Real
     mean_level: Real
     layers: dict[str, Real]
@@ -351,6 +354,8 @@ def compare_models(seeds: int = 8, crossover: float | None = None) -> Comparison
     ]
     return Comparison(
         crossover_frequency(comparison_scenario("hybrid", 1, crossover)),
+        COMPARED,
+        np.array(DISTANCES),
         decibel(every("hybrid", "rail"), every("fe", "rail")),
         decibel(mean("hybrid", "rail"), mean("fe", "rail")),
         {

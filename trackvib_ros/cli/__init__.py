@@ -36,6 +36,7 @@ COMMAND_MODULES = (
     "bag_commands",
     "ros_commands",
     "bench_commands",
+    "figure_commands",
 )
 
 
