@@ -96,6 +96,10 @@ def record(
     console.print(_record_table(recorder))
     for topic, reason in recorder.skipped.items():
         console.print(f"[yellow]not recorded:[/yellow] {topic}: {reason}")
+    received = {topic.lstrip("/") for topic in recorder.counts}
+    for topic in topics or ():
+        if topic.lstrip("/") not in received and topic not in recorder.skipped:
+            console.print(f"[yellow]no message came on[/yellow] {topic}")
     if recorder.drops:
         console.print(f"[yellow]{sum(recorder.drops.values())} messages were lost[/yellow]")
     console.print(f"[bold]{directory}[/bold]: {sum(recorder.counts.values())} messages")
