@@ -26,8 +26,10 @@ from .scenario import Channel, Layer, Scenario, Track
 RAILS = 2
 LAYERS: tuple[Layer, ...] = ("rail", "slab", "support_layer", "bridge")
 
-# Element sizes, resolution and the frequency up to which a layer follows the rail's limit are
-# chosen by measurement: tests/solver/test_line.py states the errors they leave.
+# Resolution, chosen by measurement on crts2 at 5 kHz against a basis refined until it stood still
+# (response per force on the rail): the rail is within 0.7 % away from the load and 2.9 % under it,
+# the slab within 2 % up to 4 kHz outside its nulls. A support layer that is resolved to 2 kHz and a bridge that is
+# resolved to 700 Hz change rail and slab by less than 0.1 % up to 5 kHz, although not themselves.
 SLAB_ELEMENT = 4.0
 BAY_EXTRA = 6
 SINE_MARGIN = 1.5
@@ -145,7 +147,7 @@ class Structure:
         fastenings: (R,) positions of the fastening rows (m).
         valid_band: highest frequency (Hz) up to which each layer's mesh resolves its own
             bending waves, at most the frequency limit.
-        supports: (S, N) rows of mass, damping and stiffness of the held bridge ends.
+        supports: force of every bearing, numbered 2 * span + end from 0.
     """
 
     scenario: Scenario
@@ -250,7 +252,7 @@ def assemble(scenario: Scenario) -> Structure:
     """Assemble the line of a scenario.
 
     Raises:
-        SolverError: the stiffness is singular (a part of the track is not held).
+        SolverError: the basis of an element is not independent in double precision.
     """
     track = scenario.track
     sections = beam_sections(track)
@@ -498,7 +500,6 @@ def beam_matrices(field: Field, section: BeamSection) -> tuple[sp.csr_array, sp.
     """Mass and stiffness of a free beam by Gauss quadrature: two (N, N) matrices."""
     breaks = np.concatenate([field.left, field.right])
     x, weight = _gauss(breaks, _finest(field))
-    weight = weight * (abs(field.rows(x)).sum(axis=1) > 0)
     deflection = field.rows(x)
     mass = _gram(deflection, weight * section.mass_per_length)
     stiffness = _gram(field.rotation_rows(x, 1), weight * section.bending_stiffness)
