@@ -28,8 +28,8 @@ LAYERS: tuple[Layer, ...] = ("rail", "slab", "support_layer", "bridge")
 
 # Resolution, chosen by measurement on crts2 at 5 kHz against a basis refined until it stood still
 # (response per force on the rail): the rail is within 0.7 % away from the load and 2.9 % under it,
-# the slab within 2 % up to 4 kHz outside its nulls. A support layer that is resolved to 2 kHz and a bridge that is
-# resolved to 700 Hz change rail and slab by less than 0.1 % up to 5 kHz, although not themselves.
+# the slab within 2 % up to 4 kHz outside its nulls. A support layer that is resolved to 2 kHz and
+# a bridge to 700 Hz change rail and slab by less than 0.1 % up to 5 kHz, although not themselves.
 SLAB_ELEMENT = 4.0
 BAY_EXTRA = 6
 SINE_MARGIN = 1.5
