@@ -64,9 +64,12 @@ class Graph:
         return node
 
     def once(self) -> None:
+        if not self.workers:
+            self.executor.spin_once(timeout_sec=0.05)
+            return
         for worker in self.workers:
             worker.work()
-        for _ in range(20):
+        for _ in range(5):
             self.executor.spin_once(timeout_sec=0)
         self.executor.spin_once(timeout_sec=0.001)
 

@@ -83,7 +83,9 @@ def test_demo_detects_records_and_shows(processes: Processes, tmp_path: Path, ma
     assert counts["/scenario"] == counts["/channels"] == counts["/ground_truth/passages"] == 1
 
 
-@pytest.mark.parametrize("moment", ["start", "recording", "passage"])
+@pytest.mark.parametrize(
+    "moment", ["start", pytest.param("recording", marks=pytest.mark.slow), "passage"]
+)
 def test_interrupted_demo_leaves_a_readable_bag_and_no_process(
     processes: Processes, tmp_path: Path, mark: int, moment: str
 ) -> None:
@@ -124,6 +126,7 @@ def test_killed_demo_takes_its_nodes_along(processes: Processes, tmp_path: Path,
     assert BagReader(out / "bag").verify() == []
 
 
+@pytest.mark.slow
 def test_demo_with_nothing_to_detect_does_not_claim_success(
     processes: Processes, tmp_path: Path
 ) -> None:
