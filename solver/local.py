@@ -622,7 +622,7 @@ class LocalField:
         for c, random in enumerate(self._random):
             draw = random.standard_normal((2, level.shape[1]))
             spectrum[c] = level[c] * (draw[0] + 1j * draw[1])
-        out = self._overlap.copy()
+        out: Real = self._overlap.copy()
         for d, derivative in enumerate(self.derivatives):
             shaped = spectrum * (1j * self._omega) ** (derivative - 1)
             signal = np.fft.irfft(shaped, 2 * self.hop, axis=1).T * self._window[:, None]

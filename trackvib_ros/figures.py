@@ -111,7 +111,8 @@ def spectrum(passages: list[Passage], channel: str) -> tuple[Array, Array]:
     squares = [np.abs(np.fft.rfft(p.velocity[channel] * window)) ** 2 for p in passages]
     density = 2 * step * np.mean(squares, axis=0) / (window**2).sum()
     width = max(1, round(RESOLUTION * n * step))
-    return np.fft.rfftfreq(n, step), np.convolve(density, np.ones(width) / width, "same")
+    frequency = np.fft.rfftfreq(n, step).astype(np.float64)
+    return frequency, np.convolve(density, np.ones(width) / width, "same")
 
 
 def highest(frequency: Array, density: Array, above: float) -> float:
@@ -237,7 +238,7 @@ def claims(found: Study) -> list[Claim]:
         ),
         Claim(
             "Eq. (10): -i pi omega³/2 n <j²>; the local modes damp the global ones",
-            "subtracted in Eq. (5), with exp(+i omega t): D_gg gains +i pi omega³/2 n <j²>, damping",
+            "subtracted in Eq. (5), with exp(+i omega t): D_gg gains +i pi omega³/2 n <j²>",
         ),
         Claim(
             "(3) the hybrid has fewer degrees of freedom and is efficient",

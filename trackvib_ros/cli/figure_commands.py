@@ -77,7 +77,7 @@ def validate(
     for heading in headings:
         table.add_column(heading, justify="right")
     for i, centre in enumerate(found.centres):
-        values = [
+        levels = [
             found.mean_level[i],
             found.level[np.argmax(np.abs(found.level[:, i])), i],
             found.force_level[i],
@@ -86,7 +86,7 @@ def validate(
         ]
         table.add_row(
             f"{centre:.0f}",
-            *(f"{value:+.1f}" for value in values),
+            *(f"{value:+.1f}" for value in levels),
             *(
                 f"{found.envelope[d, i]:+.1f} ± {found.spread[d, i]:.1f}"
                 for d in range(len(found.distances))
