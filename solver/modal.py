@@ -310,7 +310,7 @@ def march(
         load,
         np.empty((axles, width), dtype=tables.shapes.dtype),
         np.empty((2, width)),
-        np.empty((len(position), width)),
+        np.empty((min(CHUNK, len(position)), width)),
         fleet.kind,
         fleet.first,
         fleet.transition,
@@ -336,6 +336,9 @@ def march(
     )
     return int(lost), float(residual)
 
+
+CHUNK = 32
+"""Samples of the modes that are kept until the channels are read, so that they stay cached."""
 
 KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
@@ -495,7 +498,8 @@ def _march(  # type: ignore[no-untyped-def]
     worst = 0.0
     pushing = np.empty(position.shape[1], np.int64)
     for n in range(position.shape[0]):
-        history[n] = modal
+        row = n % history.shape[0]
+        history[row] = modal
         outputs[n] = 0.0
         pushed = 0
         for i in range(position.shape[1]):
@@ -598,7 +602,8 @@ def _march(  # type: ignore[no-untyped-def]
             modal[:size],
             modal[size:],
         )
-    _observe(history, channel_weights, outputs)
+        if row == history.shape[0] - 1 or n == position.shape[0] - 1:
+            _observe(history[: row + 1], channel_weights, outputs[n - row : n + 1])
     return lost, worst
 
 
@@ -689,9 +694,6 @@ def march_reference(
         load[:size], load[size:] = p.real, p.imag
     return lost, float(worst)
 
-
-CHUNK = 32
-"""Samples per call of the compiled kernel, so that the history of the modes stays in the cache."""
 
 FORCE_LIMIT = 1e4
 """Wheelset force per static load beyond which a run counts as diverged."""
@@ -861,7 +863,7 @@ class ModalRun:
                 active = self.traffic.active(self._next)
                 self._change_units(active, position[done], time[done])
                 self._until = self.traffic.next_change(self._next)
-            stop = min(samples, done + CHUNK, done + self._until - self._next)
+            stop = min(samples, done + self._until - self._next)
             part = slice(done, stop)
             self._march_chunk(time[part], position[part], force[part], outputs[part], answer[part])
             self._next += stop - done

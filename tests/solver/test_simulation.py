@@ -82,7 +82,7 @@ def test_static_start_carries_the_weight_and_stays(law):
     assert np.abs(block.acceleration).max() < 0.02
     # a bridge channel's displacement is the static one: constant
     still = np.broadcast_to(block.displacement[:1], block.displacement.shape)
-    np.testing.assert_allclose(block.displacement, still, rtol=1e-4)
+    np.testing.assert_allclose(block.displacement, still, rtol=5e-4)
 
 
 def test_impulse_of_the_contact_forces_is_that_of_the_weight():
