@@ -121,6 +121,7 @@ class Recorder:
         self._wanted = None if topics is None else {node.resolve_topic_name(t) for t in topics}
         self._excluded = {node.resolve_topic_name(t) for t in exclude}
         self._use_sim_time = use_sim_time
+        self._clock = node.resolve_topic_name(CLOCK)  # a site may have a clock of its own
         self._sim_ns: int | None = None
         self._held: deque[_Arrival] = deque()
         self._held_bytes = 0
@@ -241,7 +242,7 @@ class Recorder:
                 source.publishers = self._node.count_publishers(name)
                 continue
             recorded = self._is_wanted(name)
-            if not recorded and not (self._use_sim_time and name == CLOCK):
+            if not recorded and not (self._use_sim_time and name == self._clock):
                 continue
             if self._node.count_publishers(name) == 0:
                 continue
@@ -327,7 +328,7 @@ class Recorder:
 
     def _put(self, arrival: _Arrival) -> None:
         if self._use_sim_time:
-            if arrival.topic == CLOCK:
+            if arrival.topic == self._clock:
                 self._sim_ns = _clock_ns(arrival.data)
                 while self._held:
                     self._store(self._held.popleft(), self._sim_ns)

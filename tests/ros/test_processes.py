@@ -22,6 +22,7 @@ from tests.ros.harness import (
 )
 from tests.ros.test_nodes import figures, warning
 from trackvib_ros import messages as m
+from trackvib_ros.bag import BagReader
 
 pytestmark = pytest.mark.ros
 processes = pytest.fixture(processes_of_test)
@@ -111,14 +112,13 @@ def test_namespaces_keep_two_sites_apart(
     other = tmp_path / "other.toml"
     other.write_text(QUICK.read_text(encoding="utf-8").replace("200 km/h", "120 km/h"))
     heard: dict[str, list[Any]] = {}
+    clocks: dict[str, list[Any]] = {}
+    detectors: dict[str, Any] = {}
     for site, scenario in (("north", SCENARIO), ("south", str(other))):
-        for node, settings in (
-            ("sensor", f"-p scenario:={scenario} -p real_time_factor:=0.0 -p await_detectors:=1"),
-            ("detector", "-p use_sim_time:=false"),
-        ):
-            arguments = f"--ros-args -r __ns:=/{site} -p autostart:=true {settings}".split()
-            processes.start("-m", "trackvib_ros.start", node, *arguments)
         heard[site] = graph.listen(m.TRAIN_EVENTS, f"/{site}/{m.TRAIN_EVENTS.name}")
+        clocks[site] = graph.listen(m.CLOCK, f"/{site}/clock")
+        processes.command("sensor", "-s", scenario, "-n", site, "--real-time-factor", "2")
+        detectors[site] = processes.command("detect", "-n", site, "-o", str(tmp_path / site))
     found: Callable[[str], list[Any]] = lambda site: passages(heard[site])  # noqa: E731
     graph.until(lambda: found("north") and found("south"), "a passage at both sites")
     speeds = {site: found(site)[0].values["speed"].value * 3.6 for site in heard}
@@ -126,3 +126,12 @@ def test_namespaces_keep_two_sites_apart(
     assert speeds["north"] == pytest.approx(200, rel=0.1)
     assert speeds["south"] == pytest.approx(120, rel=0.1)
     assert len(found("north")) == len(found("south")) == 1
+    for site in heard:
+        times = [m.from_stamp(message.clock) for message in clocks[site]]
+        assert times == sorted(times)
+        detectors[site].send_signal(signal.SIGINT)
+        assert ended(detectors[site]) == (0, "")
+        bag = BagReader(tmp_path / site)
+        assert f"/{site}/clock" in bag.topics
+        assert bag.end_ns < 60_000_000_000  # logged in the simulated time of the site
+    assert "/clock" not in dict(graph.tester.get_topic_names_and_types())

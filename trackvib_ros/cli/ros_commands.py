@@ -70,7 +70,10 @@ def _node(module: str, parameters: dict[str, object], namespace: str) -> None:
     environment.require_ros()
     environment.domain_of(os.environ)
     environment.complete(os.environ)
-    arguments = ["trackvib", "--ros-args", "-r", f"__ns:=/{namespace.strip('/')}"]
+    site = "/" + namespace.strip("/")
+    arguments = ["trackvib", "--ros-args", "-r", f"__ns:={site}"]
+    if site != "/":  # simulated time is the site's own: two sites in one domain do not mix
+        arguments += ["-r", f"/clock:={site}/clock"]
     for name, setting in parameters.items():
         text = str(setting).lower() if isinstance(setting, bool) else str(setting)
         arguments += ["-p", f"{name}:={text}"]
@@ -83,7 +86,10 @@ def _node(module: str, parameters: dict[str, object], namespace: str) -> None:
     main(Node, arguments)
 
 
-NamespaceOption = Annotated[str, typer.Option("--namespace", "-n", help="ROS namespace.")]
+NamespaceOption = Annotated[
+    str,
+    typer.Option("--namespace", "-n", help="ROS namespace of the site; /clock moves into it."),
+]
 
 
 def sensor(

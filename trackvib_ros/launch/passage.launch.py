@@ -1,6 +1,6 @@
 """Sensor and detector of one site, configured and activated.
 
-ros2 launch trackvib_ros passage.launch.py scenario:=demo namespace:=north record_directory:=/tmp/bag
+ros2 launch trackvib_ros passage.launch.py scenario:=demo namespace:=/north
 """
 
 from pathlib import Path
@@ -29,6 +29,7 @@ def _managed(name: str, parameters: list) -> list:
         name=name,
         namespace=LaunchConfiguration("namespace"),
         parameters=parameters,
+        remappings=[("/clock", [LaunchConfiguration("namespace"), "/clock"])],
         output="screen",
         sigterm_timeout="5",
     )
