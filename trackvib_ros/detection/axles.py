@@ -20,6 +20,7 @@ from .pattern import Trace
 Array = NDArray[np.float64]
 
 _HALF = 1.25  # m either side of a wheelset that belongs to it
+_PARTNER = 3.5  # m, nearer is the same bogie
 _STEP = 0.1  # m
 _CELL = 0.2  # m, averaging of the energy
 _ROUNDS = 5
@@ -53,8 +54,8 @@ class AxleFit:
 def _neighbours(axles: Array) -> NDArray[np.int64]:
     """Class of every wheelset: has a near one before (1), behind (2), both (3), none (0)."""
     gaps = np.diff(axles)
-    before = np.concatenate([[False], gaps < 4 * _HALF])
-    behind = np.concatenate([gaps < 4 * _HALF, [False]])
+    before = np.concatenate([[False], gaps < _PARTNER])
+    behind = np.concatenate([gaps < _PARTNER, [False]])
     return before + 2 * behind
 
 

@@ -36,6 +36,8 @@ _OFFSET_COST = 12.0  # most that the place of a channel may count against a type
 _MODEL_SIGMA = 0.04  # m, systematic residuals of a right type (bogies nod, pulses overlap)
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
+_LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
+_DELAY_DOUBT = 0.015  # least disagreement of a delay that excludes a type
 _MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
 
 
@@ -144,7 +146,7 @@ class Passage:
         for h in self.hypotheses:
             if h.probability > 0.01:
                 other = float(h.fit.motion.speed_at(h.mid_time))
-                if abs(speed - other) < max(4 * sigma, 0.006 * speed):
+                if abs(speed - other) < max(4 * sigma, _DELAY_DOUBT * speed):
                     return False
         return True
 
@@ -249,9 +251,11 @@ def _scan_channel(
         found.append(_Scanned(trace, band, interval, matches))
     if not found:
         return None
-    best = max(found, key=lambda s: s.score)
-    if best.score < HOPELESS_SCORE:
-        return best
+    top = max(s.score for s in found)
+    if top < HOPELESS_SCORE:
+        return max(found, key=lambda s: s.score)
+    # the deflection under a wheel lies at the wheel; high bands peak where the rail is rough
+    best = next(s for s in found if s.score > top - _LOW_BAND_BONUS)
     return replace(best, matches=refine(best.trace, best.matches, best.interval))
 
 
@@ -440,7 +444,8 @@ def delay_speed(passage: Passage) -> tuple[float, float] | None:
     mean = float(ratio[good].mean())
     sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
     speed = float(fit.motion.speed_at(best.mid_time)) / mean
-    baseline = 2**0.5 * POSITION_SIGMA / (x[b] - x[a])
+    place = np.hypot(POSITION_SIGMA, fit.anchor_sigma[[a, b]])
+    baseline = float(np.hypot(*place)) / (x[b] - x[a])
     return speed, speed * float(np.hypot(sigma / mean, baseline))
 
 
