@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -37,6 +37,7 @@ def _end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
+WAVEFORM = m.waveform_topic("").name
 MEND_DISK = "free some space or choose another place with -o"
 
 
@@ -102,6 +103,13 @@ class Seen:
     factor: float = 0.0
     event: str = ""
     trouble: str = ""
+    published: dict[str, int] = field(default_factory=dict)
+    taken: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def caught_up(self) -> bool:
+        """True when the detector has looked at every block that the sensor has published."""
+        return all(self.taken.get(topic, 0) >= n for topic, n in self.published.items())
 
 
 class Watcher:
@@ -146,8 +154,24 @@ class Watcher:
             if status.name == "sensor: simulation" and "end_s" in values:
                 self.seen.end_s = float(values["end_s"])
                 self.seen.factor = float(values["real_time_factor"])
+            if status.name == "sensor: publishing":
+                self.seen.published = _counts(values, "published ")
+            if status.name == "detector: input":
+                self.seen.taken = _counts(values, "blocks ", "refused ")
             if values.get("failure"):
                 self.seen.trouble = values["failure"]
+
+
+def _counts(values: Mapping[str, str], *kinds: str) -> dict[str, int]:
+    """Blocks by waveform topic, the kinds added up."""
+    counts: dict[str, int] = {}
+    for key, text in values.items():
+        kind = next((kind for kind in kinds if key.startswith(kind)), None)
+        if kind is not None:
+            topic = key.removeprefix(kind).split(":")[0]
+            if topic.endswith(WAVEFORM):
+                counts[topic] = counts.get(topic, 0) + int(text)
+    return counts
 
 
 @contextmanager
@@ -236,9 +260,9 @@ def run_demo(
 def _follow(watcher: Watcher, children: Sequence[Child], stop: Stop, progress: Progress) -> None:
     """Wait for the sensor's end, a failure or a signal, and show how far the run is."""
     task = progress.add_task("assembling the track model", total=None, note="")
+    seen = watcher.seen
     while not stop and all(child.status is None for child in children):
         watcher.spin(0.1)
-        seen = watcher.seen
         if seen.trouble:
             return
         if seen.time_s > 0:
@@ -247,6 +271,10 @@ def _follow(watcher: Watcher, children: Sequence[Child], stop: Stop, progress: P
             progress.update(
                 task, description="passage", total=total, completed=seen.time_s, note=note
             )
+    sensor, detector = children
+    while not stop and sensor.status == 0 and detector.status is None and not seen.caught_up:
+        progress.update(task, description="detector catches up")
+        watcher.spin(0.1)
 
 
 def _what_is_left(bag: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ from trackvib_ros.outbox import Outbox
 from trackvib_ros.process import Stop, declare, transition, value
 from trackvib_ros.recorder import Recorder
 from trackvib_ros.settings import DETECTOR_SETTINGS
+
+DRAIN_S = 0.7
+"""Time for blocks that have arrived but were not looked at when the node is deactivated (s)."""
 
 
 class DetectorNode(LifecycleNode):  # type: ignore[misc]
@@ -119,20 +123,24 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
             self._listen(channels)
 
     def _be_quiet(self) -> None:
+        deadline = time.monotonic() + DRAIN_S
         for topic, subscription in self._inputs:
-            self._drain(topic, subscription)
+            self._drain(topic, subscription, deadline)
             self.destroy_subscription(subscription)
         self._inputs.clear()
         if self._intake is not None:
             self._publish(self._intake.finish())
         self._intake = None
 
-    def _drain(self, topic: str, subscription: Any) -> None:
-        """Take what has arrived but was not called for yet."""
+    def _drain(self, topic: str, subscription: Any, deadline: float) -> None:
+        """Take what has arrived but was not called for yet, as long as there is time."""
         with subscription.handle:
             while taken := subscription.handle.take_message(subscription.msg_type, False):
                 if self._intake is not None:
                     self._publish(self._intake.take(topic, taken[0]))
+                if time.monotonic() > deadline:
+                    self.get_logger().warning(f"ended before all blocks of {topic} were looked at")
+                    return
 
     def _listen(self, channels: dict[str, list[Channel]]) -> None:
         self._intake = Intake(channels)

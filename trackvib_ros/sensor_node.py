@@ -97,6 +97,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         if self.run is not None:
             self.run.hold()
+        self._report()
         return super().on_deactivate(state)
 
     @transition
