@@ -67,6 +67,7 @@ class NewmarkRun:
         self.traffic = traffic
         self.lost_contacts = 0
         self.equilibrium_residual = 0.0
+        self._start_energy = 0.0
         self.work = 0.0
         self.dissipated = 0.0
         self._derivatives = derivatives
@@ -129,6 +130,14 @@ class NewmarkRun:
         """Look for units that start, because a train was added."""
         self._until = 0
 
+    @property
+    def energy_residual(self) -> float | None:
+        """|stored + dissipated - work| of the line per work or energy, whichever is larger."""
+        if self._next == 0:
+            return None
+        balance = self.energy() - self._start_energy + self.dissipated - self.work
+        return abs(balance) / max(abs(self.work), self.energy(), 1e-300)
+
     def energy(self) -> float:
         """Kinetic and potential energy of the line (J)."""
         state = self._line
@@ -185,6 +194,7 @@ class NewmarkRun:
     def _step(self, place: Array, on: NDArray[np.bool_], roughness: Array, still: bool) -> Array:
         h = self.traffic.step
         if still:
+            self._start_energy = self.energy()
             return self._force
         rows, missing = self._rail(place, on)
         pushed = self._line.pushed(h, self._mass, self._damping)

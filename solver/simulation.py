@@ -137,10 +137,11 @@ class Simulation:
     @property
     def quality(self) -> QualityReport:
         """How far the samples so far can be trusted."""
+        run = self._run
         return QualityReport(
             samples=self._index,
             equilibrium_residual=self._run.equilibrium_residual,
-            energy_residual=None,
+            energy_residual=run.energy_residual if isinstance(run, NewmarkRun) else None,
             lost_contacts=self._run.lost_contacts,
             valid_band=dict(zip(self.channels, self._run.channel_band.tolist(), strict=True)),
             notes=self._run.notes,

@@ -51,6 +51,7 @@ def test_energy_of_the_line_balances_in_every_step():
     # average acceleration conserves energy exactly; what is left is the solution of the equations
     assert change == pytest.approx(newmark.work, rel=1e-9)
     assert simulation.quality.equilibrium_residual < 1e-9
+    assert simulation.quality.energy_residual < 1e-9
 
 
 def test_second_order_in_the_step():
