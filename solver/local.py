@@ -598,8 +598,8 @@ class LocalField:
         if wheels:
             self._quiet = 0
         elif self._quiet > MOST_LAGS:
-            out, self._overlap = self._overlap, np.zeros_like(self._overlap)
-            return out
+            tail, self._overlap = self._overlap, np.zeros_like(self._overlap)
+            return tail
         else:
             self._quiet += 1
         self._past.appendleft(self.powers(wheels, places))
