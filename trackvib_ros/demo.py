@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import subprocess
 import sys
@@ -133,6 +134,11 @@ class Watcher:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
+        if self._node.count_publishers(m.CLOCK.name) > 1:
+            self.seen.trouble = (
+                f"ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')} has another publisher of "
+                f"{m.CLOCK.name}: end it, or unset ROS_DOMAIN_ID to get a domain of its own"
+            )
 
     def close(self) -> None:
         """Leave ROS."""
@@ -159,7 +165,7 @@ class Watcher:
             if status.name == "detector: input":
                 self.seen.taken = _counts(values, "blocks ", "refused ")
             if values.get("failure"):
-                self.seen.trouble = values["failure"]
+                self.seen.trouble = f"{values['failure']}; {MEND_DISK}"
 
 
 def _counts(values: Mapping[str, str], *kinds: str) -> dict[str, int]:
@@ -250,7 +256,7 @@ def run_demo(
         console.print(_what_is_left(bag))
         return 130
     if watcher.seen.trouble:
-        raise InputError(f"{watcher.seen.trouble}; {MEND_DISK}")
+        raise InputError(watcher.seen.trouble)
     for child in children:
         if child.status != 0:
             raise InputError(f"{child.name} node: {child.complaint()} (log: {child.log})")

@@ -114,6 +114,16 @@ def test_interrupted_demo_leaves_a_readable_bag_and_no_process(
         assert all(b.stamp_ns == a.end_ns for a, b in pairwise(blocks))
 
 
+@pytest.mark.slow
+def test_demo_refuses_a_domain_that_has_a_clock(processes: Processes, tmp_path: Path) -> None:
+    processes.command("sensor", "-s", str(QUICK))
+    out = tmp_path / "run"
+    arguments = ("demo", "-s", str(QUICK), "-o", str(out), "--real-time-factor", "0.2")
+    status, text = ended(processes.command(*arguments))
+    assert status == 2, text
+    assert "another publisher of /clock" in text and "unset ROS_DOMAIN_ID" in text
+
+
 def test_killed_demo_takes_its_nodes_along(processes: Processes, tmp_path: Path, mark: int) -> None:
     out = tmp_path / "run"
     demo = processes.command(
