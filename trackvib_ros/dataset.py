@@ -1,4 +1,4 @@
-"""Labelled sets of recorded passages, made in parallel, resumable, each bag reproducible from itself.
+"""Labelled sets of recorded passages: parallel, resumable, each bag reproducible from itself.
 
 A case is one combination of the lists in a specification. Its complete scenario, seeds included, is
 stored in its bag; :func:`write_bag` makes the same bag from that text again.
@@ -529,7 +529,7 @@ def _here(
 
 def _on_cluster(cases: Sequence[Case], directory: Path, address: str) -> Iterator[tuple[Case, str]]:
     try:
-        from distributed import Client
+        from distributed import Client  # type: ignore[import-not-found,unused-ignore]
         from distributed import as_completed as completed
     except ImportError:
         raise InputError(

@@ -131,7 +131,7 @@ def read_bag(path: Path) -> tuple[list[Channel], list[Waveform], list[PassageTru
                 values = {pair.key: pair.value for pair in status.values}
                 try:
                     x = float(values["x"].removesuffix(" m"))
-                    channels[status.name] = Channel(status.name, x, values["layer"])  # type: ignore[arg-type]
+                    channels[status.name] = Channel(status.name, x, values["layer"])
                 except (KeyError, ValueError) as failure:
                     raise InputError(f"bag {path}: channel {status.name!r}: {failure}") from None
         truths = []
@@ -229,7 +229,10 @@ def _score_passage(
         true_speed = _mid_speed(truth, times_ns)
         score.speed_error = estimate.value / true_speed - 1
         score.speed_sigma = estimate.sigma / true_speed
-    low, high = event.stamp_ns - 10**9, int(departure or times_ns[-1]) + 10**9
+    low, high = (
+        event.stamp_ns - 10**9,
+        (departure if isinstance(departure, int) else times_ns[-1]) + 10**9,
+    )
     found = np.array([e.stamp_ns for e in axles if low <= e.stamp_ns <= high]) * 1e-9
     times = np.array(times_ns) * 1e-9
     score.axles_found = int(found.size)

@@ -46,7 +46,7 @@ def test_foreign_pairs_are_refused(change, named):
 
 
 def test_channel_names_its_layers():
-    with pytest.raises(InputError, match="sleeper.*rail, slab"):
+    with pytest.raises(InputError, match=r"sleeper.*rail, slab"):
         Channel("a", 0.0, "sleeper")
     with pytest.raises(InputError, match="finite"):
         Channel("a", float("nan"))

@@ -32,7 +32,8 @@ _COVERED = 0.6  # part of a wheelset's window that must have been measured
 class AxleFit:
     """Wheelsets of one train at one or several rail channels.
 
-    Arrays have shape (channels, wheelsets): time (s), residual (m, channel offset removed), contrast (ln of the energy at
+    Arrays have shape (channels, wheelsets): time (s), residual (m, channel offset
+    removed), contrast (ln of the energy at
     the wheelset over that beside it), observed.
     """
 
@@ -56,7 +57,7 @@ def _neighbours(axles: Array) -> NDArray[np.int64]:
     gaps = np.diff(axles)
     before = np.concatenate([[False], gaps < _PARTNER])
     behind = np.concatenate([gaps < _PARTNER, [False]])
-    return before + 2 * behind
+    return np.asarray(before + 2 * behind, dtype=np.int64)
 
 
 def _windows(trace: Trace, motion: Motion, places: Array, half: float) -> tuple[Array, Array]:
@@ -74,8 +75,9 @@ def _windows(trace: Trace, motion: Motion, places: Array, half: float) -> tuple[
 def _pulse(energy: Array, floor: float, classes: NDArray[np.int64], symmetric: bool) -> Array:
     """Mean pulse per class on the grid of the energies, shape (4, cells), mean 1.
 
-    The plain mean gives the finest spacing of wheelsets but no place: it takes up an error common to
-    all of them. ``symmetric``: the pulse of a leading wheelset is the mirror image of a trailing
+    The plain mean gives the finest spacing of wheelsets but no place: it takes up an error
+    common to all of them. ``symmetric``: the pulse of a leading wheelset is the mirror
+    image of a trailing
     one's, which fixes the place.
     """
     cells = energy.shape[1]
@@ -85,10 +87,7 @@ def _pulse(energy: Array, floor: float, classes: NDArray[np.int64], symmetric: b
         members = classes == c
         if not members.any():
             continue
-        if members.sum() >= 3:
-            shape = np.mean(scaled[members], axis=0)
-        else:
-            shape = np.mean(scaled, axis=0)
+        shape = np.mean(scaled[members] if members.sum() >= 3 else scaled, axis=0)
         smooth = np.convolve(np.pad(shape, 2, "edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         out[c] = smooth / smooth.mean()
     if symmetric:

@@ -55,6 +55,7 @@ class TrainType:
     source: str = ""
 
     def __post_init__(self) -> None:
+        """Check the axle positions."""
         axles = np.asarray(self.axle_positions, dtype=float)
         if axles.size < 2 or not np.all(np.isfinite(axles)) or np.any(np.diff(axles) < 0.5):
             raise InputError(
@@ -95,6 +96,7 @@ class Catalogue:
     _names: tuple[str, ...] = field(init=False, repr=False, compare=False, default=())
 
     def __post_init__(self) -> None:
+        """Check the names."""
         names = tuple(train.name for train in self.types)
         if not names:
             raise InputError("the catalogue has no train; give at least one [[train]]")
@@ -104,12 +106,15 @@ class Catalogue:
         object.__setattr__(self, "_names", names)
 
     def __iter__(self) -> Iterator[TrainType]:
+        """Iterate over the types."""
         return iter(self.types)
 
     def __len__(self) -> int:
+        """Return the number of types."""
         return len(self.types)
 
     def __getitem__(self, name: str) -> TrainType:
+        """Return the type of that name."""
         try:
             return self.types[self._names.index(name)]
         except ValueError:

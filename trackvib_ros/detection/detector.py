@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +54,7 @@ class DetectorConfig:
     max_lag: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check the settings."""
         if not 1 <= self.min_speed < self.max_speed <= 200:
             raise InputError(
                 f"min_speed = {self.min_speed} m/s and max_speed = {self.max_speed} m/s must obey "
@@ -269,8 +271,8 @@ class TrainDetector:
         elif now_ns - self._event.start_ns > self.config.max_event * 1e9:
             events += self._close(now_ns)
             for other in self._groups.values():
-                for local in range(len(other.index)):
-                    other.trigger.relearn(local)
+                for row in range(len(other.index)):
+                    other.trigger.relearn(row)
         elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
             events += self._update(self._event, now_ns)
         return events
@@ -430,7 +432,7 @@ def detect(
         dt_ns = round(1e9 * float(np.median(steps)))
         cuts = np.flatnonzero(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) + 1
         limits = [0, *(int(c) for c in cuts), len(data)]
-        pieces = list(zip(limits[:-1], limits[1:], strict=True))
+        pieces = list(pairwise(limits))
         start_ns = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
     events: list[TrainEvent] = []
     for (first, last), stamp in zip(pieces, start_ns, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 from solver import InputError
 
@@ -40,6 +40,7 @@ class Channel:
     layer: Layer = "rail"
 
     def __post_init__(self) -> None:
+        """Check layer and position."""
         if self.layer not in LAYERS:
             raise InputError(
                 f"channel {self.name!r}: layer = {self.layer!r} is not one of {', '.join(LAYERS)}"
@@ -57,6 +58,7 @@ class Estimate:
     unit: str
 
     def __str__(self) -> str:
+        """Return value, sigma and unit as text."""
         return f"{self.value:.6g} ± {self.sigma:.2g} {self.unit}"
 
 
@@ -151,7 +153,7 @@ class TrainEvent:
             else:
                 values[name] = _decode(text)
         return cls(
-            kind=cast(EventKind, kind),
+            kind=kind,
             stamp_ns=int(_decode(pairs["stamp_ns"])),
             sigma_s=float(_decode(pairs["sigma_s"])),
             confidence=float(_decode(pairs["confidence"])),

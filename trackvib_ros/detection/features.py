@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 BANDS: tuple[tuple[float, float], ...] = ((5.0, 150.0), (20.0, 400.0), (60.0, 800.0))
 """Frequency bands (Hz) in which energy is measured; the best one is kept per passage.
 
-Their filters have linear phase (Bessel low-pass; delayed signal minus its moving mean as high-pass):
-the slow pulse of a wheel at 40 km/h keeps its symmetry and its place.
+Their filters have linear phase (Bessel low-pass; delayed signal minus its moving mean as
+high-pass): the slow pulse of a wheel at 40 km/h keeps its symmetry and its place.
 """
 
 FRAME = 10
@@ -283,7 +283,7 @@ class GroupStream:
             self._last[c] = x[-1, c]
         shape = (count // self.decimation, self.decimation, x.shape[1])
         holes = bad[:count].reshape(shape).mean(axis=1)
-        return x, holes, invalid.reshape(shape).any(axis=1)
+        return x, holes, np.asarray(invalid.reshape(shape).any(axis=1))
 
     def _filter(self, x: Array, holes: Array, invalid: NDArray[np.bool_]) -> None:
         n, d = len(x) // self.decimation, self.decimation
@@ -361,7 +361,7 @@ class GroupStream:
         b = len(self.bands)
         return Window(
             origin_ns=from_ns,
-            time=(stamps[first:last] - from_ns) * 1e-9,
+            time=np.asarray((stamps[first:last] - from_ns) * 1e-9, dtype=np.float64),
             energy=part[:, :b],
             low=part[:, b],
             peak=part[:, b + 1],

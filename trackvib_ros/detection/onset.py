@@ -1,9 +1,9 @@
 """Causal energy trigger per channel: short-term energy against a noise floor that is learned.
 
 The short-term average over 1, 4 and 16 frames is compared with the floor in every band. The
-thresholds follow from the chi-square law of the energy of band-limited Gaussian noise: 2 B T degrees
-of freedom in a band of width B over time T (Urkowitz, Proc. IEEE 55, 1967, 523). The floor is frozen
-while an event lasts.
+thresholds follow from the chi-square law of the energy of band-limited Gaussian noise: 2 B T
+degrees of freedom in a band of width B over time T (Urkowitz, Proc. IEEE 55, 1967, 523). The floor
+is frozen while an event lasts.
 """
 
 from __future__ import annotations

@@ -57,10 +57,9 @@ class Trace:
         self.name, self.x, self.time, self.step = name, x, time, step
         self.valid = valid
         known = np.flatnonzero(valid)
-        if known.size == 0:
-            filled = np.full(energy.shape, floor)
-        else:
-            filled = np.interp(np.arange(energy.size), known, energy[known])
+        filled: Array = np.full(energy.shape, floor)
+        if known.size:
+            filled = np.asarray(np.interp(np.arange(energy.size), known, energy[known]))
         outside = (time < within[0]) | (time > within[1])
         if outside.any():
             filled = np.where(outside, floor, filled)
@@ -144,7 +143,7 @@ def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: 
     root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
     times = epoch + 2 * edges / (v + root)
     level = trace.level(times[:, :-1], times[:, 1:])
-    return np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0)
+    return np.asarray(np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0))
 
 
 def _scan_once(
@@ -205,7 +204,7 @@ def _accelerations(duration: float, step_m: float) -> Array:
     """Accelerations whose bend over the duration differs by ``step_m`` (m) at the ends."""
     step = 32 * step_m / duration**2
     count = int(MAX_ACCELERATION / step)
-    return step * np.arange(-count, count + 1)
+    return np.asarray(step * np.arange(-count, count + 1), dtype=np.float64)
 
 
 def scan(
