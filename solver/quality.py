@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from .scenario import Scenario
 
@@ -64,13 +63,17 @@ class _LowPass:
     """Streaming fourth-order low-pass that starts from a steady state."""
 
     def __init__(self, edge: float, step: float) -> None:
-        self._sections = butter(4, edge, fs=1 / step, output="sos")
+        # only checks need it, and it takes longer to import than all the rest
+        from scipy import signal
+
+        self._signal = signal
+        self._sections = signal.butter(4, edge, fs=1 / step, output="sos")
         self._state: Array | None = None
 
     def __call__(self, values: Array) -> Array:
         if self._state is None:
-            self._state = sosfilt_zi(self._sections)[:, :, np.newaxis] * values[0]
-        filtered, self._state = sosfilt(self._sections, values, axis=0, zi=self._state)
+            self._state = self._signal.sosfilt_zi(self._sections)[:, :, np.newaxis] * values[0]
+        filtered, self._state = self._signal.sosfilt(self._sections, values, axis=0, zi=self._state)
         return np.asarray(filtered)
 
 
