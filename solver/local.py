@@ -553,11 +553,18 @@ class LocalField:
         track = self.scenario.track
         if channel.quantity == "strain":
             if channel.layer == "rail":
-                return np.full(len(omega), abs(channel.fibre))
+                return abs(channel.fibre) * omega  # the pattern is curvature per velocity
             plate = track.slab if channel.layer == "slab" else track.support_layer
             return abs(channel.fibre) * plate_beam(plate).wavenumber(omega) ** 2
         if channel.quantity == "fastening_force":
+            row = self._nearest_row(self.scenario.channel_x(channel))
             pad = 2 * track.fastening.stiffness + 2j * omega * track.fastening.damping
+            for change in track.variation:
+                if change.start <= row <= change.end:
+                    if change.parameter == "fastening.stiffness":
+                        pad = pad.real * change.factor + 1j * pad.imag
+                    elif change.parameter == "fastening.damping":
+                        pad = pad.real + 1j * pad.imag * change.factor
             return np.asarray(np.abs(pad))
         return np.ones(len(omega))
 

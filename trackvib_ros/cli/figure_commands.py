@@ -72,7 +72,7 @@ def validate(
         f"{found.crossover:.0f} Hz",
         title_style="bold",
     )
-    headings = ["Hz", "rail", "worst\nseed", "force", "slab", "support\nlayer"]
+    headings = ["Hz", "rail", "worst\nseed", "force", "slab", "layer"]
     headings += [f"rail at\n{distance:.0f} m" for distance in found.distances]
     for heading in headings:
         table.add_column(heading, justify="right")
@@ -88,7 +88,7 @@ def validate(
             f"{centre:.0f}",
             *(f"{value:+.1f}" for value in levels),
             *(
-                f"{found.envelope[d, i]:+.1f} ± {found.spread[d, i]:.1f}"
+                f"{found.envelope[d, i]:+.1f}±{found.spread[d, i]:.1f}"
                 for d in range(len(found.distances))
             ),
             end_section=bool(centre * 10**0.05 < found.crossover * 1.05 < centre * 10**0.15),
