@@ -34,4 +34,4 @@ class Waveform:
     @property
     def end_ns(self) -> int:
         """Time of the first sample after the block (ns): the stamp a gapless successor has."""
-        return self.stamp_ns + self.dt_ns * self.data.shape[0]
+        return self.stamp_ns + self.dt_ns * int(self.data.shape[0])
