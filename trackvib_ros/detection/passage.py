@@ -37,6 +37,7 @@ _MODEL_SIGMA = 0.04  # m, systematic residuals of a right type (bogies nod, puls
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
 _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
+_SCALE_DOUBT = 0.12  # a delay off by less speaks of an unknown type, by more of a clock
 _DELAY_DOUBT = 0.015  # least disagreement of a delay that excludes a type
 _MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
 
@@ -323,7 +324,7 @@ def find_passage(
 
 def _direction(
     usable: Sequence[_Scanned], best: Match
-) -> tuple[int, list[_Scanned], list[tuple[str, float, float]]]:
+) -> tuple[int, list[_Scanned], list[tuple[str, float, float]], tuple[float, float] | None]:
     """Direction from the order of the channels; channels whose clock fits neither direction."""
     starts: dict[str, float] = {}
     for s in usable:
@@ -333,6 +334,7 @@ def _direction(
     reference = usable[0]
     votes = []
     offsets: list[tuple[str, float, float]] = []
+    scale: tuple[float, float] | None = None
     kept = [reference]
     for s in usable[1:]:
         if s.trace.name not in starts:
@@ -342,22 +344,27 @@ def _direction(
         if abs(baseline) < 0.5:
             kept.append(s)
             continue
+        # another type of nearly the same pattern may explain the delay where the best does not
+        speeds = [m.speed for m in usable[0].matches if m.score > best.score - 0.1]
+        error, sign = min(
+            (abs(delay - sign * baseline / v) * v, sign) for v in speeds for sign in (1, -1)
+        )
         expected = baseline / best.speed
-        error = min((abs(delay - sign * expected), sign) for sign in (1, -1))
-        tolerance = max(1.2 / best.speed, 0.06 * abs(expected))
-        if error[0] < tolerance:
-            votes.append(error[1])
+        if error < max(0.8, 0.04 * abs(baseline)):
+            votes.append(sign)
             kept.append(s)
+        elif abs(abs(delay / expected) - 1) < _SCALE_DOUBT:
+            scale = (abs(baseline / delay), 0.05 * best.speed / abs(baseline))
         else:
             offsets.append((s.trace.name, delay - expected, 0.5 / best.speed))
     if not votes or abs(sum(votes)) != len(votes):
-        return 0, [reference] if votes else kept, offsets
-    return votes[0], kept, offsets
+        return 0, [reference] if votes else kept, offsets, scale
+    return votes[0], kept, offsets, scale
 
 
 def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
     best = reference.matches[0]
-    direction, kept, offsets = _direction(usable, best)
+    direction, kept, offsets, scale = _direction(usable, best)
     table: dict[tuple[str, bool], list[float]] = {}
     for s in kept:
         for match in s.matches:
@@ -383,6 +390,7 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
         direction=direction,
         clock_offset=tuple(offsets),
         quality=("unsynchronised",) if offsets else (),
+        delay=scale,
     )
     if hypotheses and direction:
         passage = replace(passage, delay=delay_speed(passage))
