@@ -101,11 +101,21 @@ class Seen:
 
     time_s: float = 0.0
     end_s: float = 0.0
+    first: tuple[float, float] | None = None
+    last: tuple[float, float] | None = None
     factor: float = 0.0
     event: str = ""
     trouble: str = ""
     published: dict[str, int] = field(default_factory=dict)
     taken: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def pace(self) -> str:
+        """How fast the run was, from the first to the last word of the clock."""
+        if self.first is None or self.last is None or self.last[1] <= self.first[1]:
+            return "too short to tell"
+        simulated, wall = (b - a for a, b in zip(self.first, self.last, strict=True))
+        return f"{simulated:.2f} s simulated in {wall:.2f} s: {simulated / wall:.2f} x real time"
 
     @property
     def caught_up(self) -> bool:
@@ -147,7 +157,10 @@ class Watcher:
         rclpy.try_shutdown()
 
     def _on_clock(self, message: Any) -> None:
-        self.seen.time_s = m.from_stamp(message.clock) * 1e-9
+        seen = self.seen
+        seen.time_s = m.from_stamp(message.clock) * 1e-9
+        seen.last = (seen.time_s, time.monotonic())
+        seen.first = seen.first or seen.last
 
     def _on_event(self, message: DiagnosticArray) -> None:
         for event in m.read_events(message):
@@ -260,7 +273,9 @@ def run_demo(
     for child in children:
         if child.status != 0:
             raise InputError(f"{child.name} node: {child.complaint()} (log: {child.log})")
-    return _tell(bag, directory, figure, console)
+    status = _tell(bag, directory, figure, console)
+    console.print(f"run:    {watcher.seen.pace}", highlight=False)
+    return status
 
 
 def _follow(watcher: Watcher, children: Sequence[Child], stop: Stop, progress: Progress) -> None:
