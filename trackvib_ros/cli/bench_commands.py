@@ -15,6 +15,9 @@ from rich.table import Table
 
 from solver import InputError
 
+WIDTH = 110
+"""Columns of the table where there is no terminal."""
+
 
 def register(app: typer.Typer) -> None:
     """Add this group's command to the application."""
@@ -53,6 +56,8 @@ def bench(
     if group:
         cases = [case for case in cases if case.group in group]
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
     table = Table(title="cost on one core", title_style="bold")
     table.add_column("case", overflow="fold")
     for heading in (
@@ -101,9 +106,7 @@ def bench(
                 f"({at[0]:g} to {at[-1]:g})"
             )
     if output is not None:
-        rows = [
-            {k: None if v != v else v for k, v in asdict(result).items()} for result in results
-        ]
+        rows = [{k: None if v != v else v for k, v in asdict(result).items()} for result in results]
         content = {"results": rows, "exponents": exponents}
         output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         console.print(f"results: {output}")
