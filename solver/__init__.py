@@ -1,8 +1,9 @@
 """Vehicle-track-bridge dynamics: hierarchical-beam FE extended to 5 kHz by SEA. No ROS here."""
 
+from .check import check_run
 from .errors import InputError, SolverError
 from .motion import TrainMotion
-from .quality import QualityReport, check_run
+from .quality import QualityReport
 from .scenario import (
     GRAVITY,
     Scenario,
