@@ -11,8 +11,10 @@ import json
 import os
 import shutil
 import sys
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -214,19 +216,23 @@ class Spec:
         ]
 
 
-def _base(name: str) -> Scenario:
+def _base(name: str, root: Path) -> Scenario:
     if name in preset_names()["scenario"]:
         return load_scenario_text(preset_text(name), name)
-    return load_scenario(Path(name))
+    return load_scenario(root / name)
 
 
-def scenario_of(case: Case) -> Scenario:
+def scenario_of(case: Case, root: Path = Path()) -> Scenario:
     """The scenario of a case, before noise and range follow from its clean signal.
+
+    Args:
+        case: what is combined.
+        root: folder from which the path of a scenario file is meant.
 
     Raises:
         InputError: the combination is impossible.
     """
-    base = _base(case.scenario)
+    base = _base(case.scenario, root)
     speed = case.speed_kmh / 3.6
     length = base.line.length
     trains = []
@@ -391,18 +397,33 @@ def write_bag(
     if directory.exists():
         raise InputError(f"{directory} exists already: not overwriting it; name another directory")
     acceleration, truths, _ = computed or _computed(scenario)
+    # unique across hosts; inside it the bag has its own name, which names its files
+    part = directory.with_name(f".{directory.name}.{uuid.uuid4().hex}.part")
+    part.mkdir(parents=True)
+    try:
+        _write(scenario, part / directory.name, custom_data or {}, acceleration, truths)
+        (part / directory.name).rename(directory)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write(
+    scenario: Scenario,
+    directory: Path,
+    custom_data: Mapping[str, str],
+    acceleration: NDArray[np.float64],
+    truths: Sequence[PassageTruth],
+) -> None:
     sensors = SensorArray(scenario, [channel.name for channel in scenario.channel])
-    part = directory.with_name(f".{directory.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
     messages = _Messages()
     custom = {
         "scenario": scenario.to_toml(),
         "seed": str(scenario.irregularity.seed),
         "trackvib_version": __version__,
-        **(custom_data or {}),
+        **custom_data,
     }
     latched = Qos(durability="transient_local")
-    writer = BagWriter(part, custom_data=custom, queue_bytes=1 << 40)
+    writer = BagWriter(directory, custom_data=custom, queue_bytes=1 << 40)
 
     def topic(name: str, kind: str, qos: Qos) -> str:
         full = f"/{name}"
@@ -443,9 +464,7 @@ def write_bag(
         writer.write(name, stamp_ns, stamp_ns, data)
     writer.close()
     if writer.failure is not None:
-        shutil.rmtree(part, ignore_errors=True)
         raise OSError(writer.failure)
-    part.rename(directory)
 
 
 def _truth_row(truth: PassageTruth) -> tuple[str, str, dict[str, str]]:
@@ -453,12 +472,12 @@ def _truth_row(truth: PassageTruth) -> tuple[str, str, dict[str, str]]:
     return f"truth: train {truth.train}", text, truth.to_dict()
 
 
-def make_case(case: Case, directory: Path) -> str:
+def make_case(case: Case, directory: Path, root: Path = Path()) -> str:
     """Make the bag of a case in ``directory``; ``made`` or ``there`` if it was there already."""
     target = directory / case.name
     if (target / "metadata.yaml").is_file():
         return "there"
-    scenario = _ended(scenario_of(case))
+    scenario = _ended(scenario_of(case, root))
     computed = _computed(scenario)
     scenario = _worn(scenario, case, *computed)
     try:
@@ -492,8 +511,12 @@ def make_dataset(
     Raises:
         InputError: the directory holds another dataset, or the extra ``cluster`` is missing.
     """
+    root = Path.cwd()
+    for name in spec.scenarios:
+        _base(name, root)
+    _Messages()  # fails at once, not case by case, where the message definitions are missing
     cases = spec.expand()
-    directory.mkdir(parents=True, exist_ok=True)
+    directory = directory.resolve()
     index = directory / "dataset.json"
     content = json.dumps(
         {"spec": asdict(spec), "cases": [asdict(case) for case in cases]}, indent=1
@@ -503,31 +526,47 @@ def make_dataset(
             f"{directory} holds another dataset ({index} has a different specification): choose "
             "another directory"
         )
-    index.write_text(content, "utf-8")
-    for left in directory.glob(".*.part"):
-        shutil.rmtree(left, ignore_errors=True)
     result: dict[str, str] = {}
-    run = (
-        _on_cluster(cases, directory, scheduler) if scheduler else _here(cases, directory, workers)
-    )
-    for case, outcome in run:
-        result[case.name] = outcome
-        if progress:
-            progress(len(result), len(cases), f"{case.name}: {outcome}")
+    with _cluster(scheduler) if scheduler else _pool(workers) as submit:
+        directory.mkdir(parents=True, exist_ok=True)
+        index.write_text(content, "utf-8")
+        _sweep(directory)
+        for case, outcome in submit(cases, directory, root):
+            if outcome == "made" and not (directory / case.name).is_dir():
+                outcome = f"failed: made on a worker that does not share {directory}"
+            result[case.name] = outcome
+            if progress:
+                progress(len(result), len(cases), f"{case.name}: {outcome}")
+        _sweep(directory)
     return result
 
 
-def _here(
-    cases: Sequence[Case], directory: Path, workers: int | None
-) -> Iterator[tuple[Case, str]]:
+def _sweep(directory: Path) -> None:
+    """Remove what killed workers left unfinished."""
+    for left in directory.glob(".*.part"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+Submit = Callable[[Sequence[Case], Path, Path], Iterator[tuple[Case, str]]]
+
+
+@contextmanager
+def _pool(workers: int | None) -> Iterator[Submit]:
     with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
-        futures = {pool.submit(make_case, case, directory): case for case in cases}
-        for future in as_completed(futures):
-            failure = future.exception()
-            yield futures[future], future.result() if failure is None else f"failed: {failure}"
+
+        def submit(
+            cases: Sequence[Case], directory: Path, root: Path
+        ) -> Iterator[tuple[Case, str]]:
+            futures = {pool.submit(make_case, case, directory, root): case for case in cases}
+            for future in as_completed(futures):
+                failure = future.exception()
+                yield futures[future], future.result() if failure is None else f"failed: {failure}"
+
+        yield submit
 
 
-def _on_cluster(cases: Sequence[Case], directory: Path, address: str) -> Iterator[tuple[Case, str]]:
+@contextmanager
+def _cluster(address: str) -> Iterator[Submit]:
     try:
         from distributed import Client  # type: ignore[import-not-found,unused-ignore]
         from distributed import as_completed as completed
@@ -535,15 +574,39 @@ def _on_cluster(cases: Sequence[Case], directory: Path, address: str) -> Iterato
         raise InputError(
             "--scheduler needs Dask: install it with  pip install 'trackvib[cluster]'"
         ) from None
-    with Client(address, timeout="20s") as client:
-        # a lost worker's cases are run again; a bag appears whole or not at all, so none doubles
-        futures = {
-            client.submit(make_case, case, directory.resolve(), retries=3, pure=False): case
-            for case in cases
-        }
-        for future in completed(futures):
-            failure = future.exception()
-            yield futures[future], future.result() if failure is None else f"failed: {failure}"
+    if not address.rpartition(":")[2].isdigit():
+        raise InputError(
+            f"--scheduler {address}: must end with a port, such as tcp://192.168.0.10:8786"
+        )
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except OSError as failure:
+        raise InputError(
+            f"--scheduler {address}: no Dask scheduler answers there ({failure}); give the address "
+            "that `dask scheduler` prints, such as tcp://192.168.0.10:8786"
+        ) from None
+    with client:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise InputError(
+                f"--scheduler {address}: it has no worker; start some with  dask worker {address}"
+            )
+
+        def submit(
+            cases: Sequence[Case], directory: Path, root: Path
+        ) -> Iterator[tuple[Case, str]]:
+            # The scheduler gives a lost worker's cases to another. A bag appears whole or not at
+            # all, under one name, so a case that ran twice is still there once.
+            futures = {
+                client.submit(make_case, case, directory, root, pure=False): case for case in cases
+            }
+            for future in completed(futures, loop=client.loop):
+                if future.status == "finished":
+                    yield futures[future], future.result()
+                else:
+                    failure = None if future.cancelled() else future.exception()
+                    yield futures[future], f"failed: {failure or 'the scheduler was lost'}"
+
+        yield submit
 
 
 EXAMPLE = """\

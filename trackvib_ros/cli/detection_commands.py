@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from solver import InputError, load_scenario_text
+from trackvib_ros import __version__
 
 
 @contextmanager
@@ -96,12 +97,22 @@ def dataset(
     if output is None:
         raise InputError("-o is missing: name the directory to make")
     if again is not None:
+        if spec is not None:
+            raise InputError(
+                f"--again {again} and the specification {spec} exclude each other: give one"
+            )
         from trackvib_ros.bag import BagReader
 
         with BagReader(again) as reader:
             stored = dict(reader.custom_data)
         if "scenario" not in stored:
             raise InputError(f"{again} does not hold its scenario: it cannot be made again")
+        version = stored.get("trackvib_version", "unknown")
+        if version != __version__:
+            console.print(
+                f"[yellow]{again} was made by version {version}, this is {__version__}: the new "
+                "bag may differ from it[/yellow]"
+            )
         scenario = load_scenario_text(stored["scenario"], str(again))
         make.write_bag(scenario, output, {k: stored[k] for k in ("case",) if k in stored})
         console.print(f"[bold]{output}[/bold] made from the scenario in {again}")

@@ -1,0 +1,82 @@
+"""A dataset on a real Dask scheduler and two real workers, one of which is killed while it works."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from solver import InputError, load_scenario_text, preset_text
+from trackvib_ros.dataset import Spec, make_dataset
+
+SPEC = Spec(scenarios=("short.toml",), trains=("metro",), snr_db=(20.0,), repeats=6, seed=3)
+
+
+def wait_for(condition, what, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.02)
+
+
+def test_address_needs_a_port(tmp_path):
+    pytest.importorskip("distributed", reason="needs Dask: pip install '.[cluster]'")
+    with pytest.raises(InputError, match="must end with a port"):
+        make_dataset(Spec(), tmp_path / "set", scheduler="somewhere")
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None,
+    reason="needs Dask: pip install '.[cluster]'",
+)
+def test_a_killed_worker_loses_and_doubles_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    demo = load_scenario_text(preset_text("demo"), "demo")
+    solution = demo.solution.model_copy(update={"frequency_limit": 600.0})
+    short = demo.model_copy(update={"solution": solution})
+    (tmp_path / "short.toml").write_text(short.to_toml(), "utf-8")
+    elsewhere = tmp_path / "elsewhere"  # the workers' folder is not the client's
+    elsewhere.mkdir()
+    file = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "distributed.cli.dask_"]
+    local = ["--scheduler-file", str(file), "--no-dashboard"]
+    worker = [*dask[:2], dask[2] + "worker", *local, "--no-nanny", "--nthreads", "1"]
+    scheduler = [*dask[:2], dask[2] + "scheduler", *local, "--host", "127.0.0.1", "--port", "0"]
+    processes = [
+        subprocess.Popen(command, cwd=elsewhere, stderr=subprocess.DEVNULL)
+        for command in (scheduler, worker, worker)
+    ]
+    try:
+        wait_for(lambda: file.exists() and file.read_text().endswith("}"), "no scheduler")
+        address = json.loads(file.read_text())["address"]
+        from distributed import Client
+
+        with Client(address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        told = []
+
+        def step(done, total, name):
+            told.append(name)
+            if len(told) == 2:
+                processes[1].kill()
+
+        outcome = make_dataset(SPEC, tmp_path / "set", scheduler=address, progress=step)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    names = sorted(case.name for case in SPEC.expand())
+    assert sorted(outcome) == names and len(told) == len(names)
+    assert set(outcome.values()) <= {"made", "there"}
+    found = sorted(path.name for path in (tmp_path / "set").iterdir())
+    assert found == [*names, "dataset.json"]
+
+    # the same bytes as without a cluster: no bag is torn, and where it was made does not matter
+    make_dataset(SPEC, tmp_path / "local", workers=1)
+    for name in names:
+        for path in (tmp_path / "local" / name).iterdir():
+            assert (tmp_path / "set" / name / path.name).read_bytes() == path.read_bytes()
