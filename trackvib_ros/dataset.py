@@ -2,6 +2,8 @@
 
 A case is one combination of the lists in a specification. Its complete scenario, seeds included, is
 stored in its bag; :func:`write_bag` makes the same bag from that text again.
+The bytes are the same if the number of BLAS threads is (``OPENBLAS_NUM_THREADS``); otherwise, or on
+another processor, numbers differ in their last digits.
 """
 
 from __future__ import annotations
