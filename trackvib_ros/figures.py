@@ -253,7 +253,7 @@ def draw(found: Study, folder: Path) -> list[Path]:
     """Write fig3.png ... fig8.png and claims.md into ``folder``; returns the paths.
 
     Raises:
-        InputError: no such folder, or a file exists already.
+        InputError: ``folder`` is a file, or one of its files exists already.
     """
     import matplotlib
 
@@ -261,6 +261,7 @@ def draw(found: Study, folder: Path) -> list[Path]:
     from matplotlib import pyplot as plt
 
     paths = output_paths(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     scenario, hybrid, full = found.scenario, found.hybrid, found.resolved
     milliseconds = 1e3 * hybrid.time
     named = "hybrid, DOF 35/35/35/10", "fe resolved to 5 kHz"
@@ -347,10 +348,10 @@ def output_paths(folder: Path) -> list[Path]:
     """The files of :func:`draw`.
 
     Raises:
-        InputError: no such folder, or a file exists already.
+        InputError: ``folder`` is a file, or one of its files exists already.
     """
-    if not folder.is_dir():
-        raise InputError(f"output {folder}: there is no such folder; make it first")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"output {folder}: is a file, not a folder; choose another -o")
     paths = [folder / f"{name}.png" for name in FIGURES] + [folder / "claims.md"]
     for path in paths:
         if path.exists():
