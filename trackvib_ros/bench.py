@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from solver import Scenario, Simulation, load_scenario, train_preset
+from solver import Scenario, Simulation, load_scenario
 from trackvib_ros.sensor import SensorArray
 
 if sys.version_info >= (3, 11):
@@ -54,31 +54,26 @@ class Case:
 
     Attributes:
         name: shown in the table. group: cases of one group belong together.
-        scenario: scenario preset. train: train preset that replaces its trains.
+        scenario: scenario preset.
         cars: CRH3 cars that replace its train; 0 keeps it.
         spans: number of 32 m spans; 0 keeps the line.
         solution: entries of ``[solution]`` that differ.
-        duration: simulated time that is timed (s); 0 is the whole run.
         sensors: whether the virtual accelerometers are run and timed too.
         reference: case that cost is compared with (ratio).
         truth: case that force and acceleration are compared with (error).
         limit: whether the share of the machine's own rate is measured.
-        slow: whether it is left out unless asked for.
     """
 
     name: str
     group: str
     scenario: str
-    train: str = ""
     cars: int = 0
     spans: int = 0
     solution: Mapping[str, Any] = field(default_factory=dict)
-    duration: float = 0.0
     sensors: bool = False
     reference: str = ""
     truth: str = ""
     limit: bool = False
-    slow: bool = False
 
     @property
     def size(self) -> float:
@@ -95,7 +90,7 @@ class Result:
         states: modes (or coordinates) stepped. step: time step (s).
         simulated, cpu: simulated and CPU time (s), preparation excluded.
         steps_per_second: steps per CPU second. real_time_factor: simulated per CPU second.
-        preparation: time until the first block (s). peak_memory: of the process (bytes).
+        preparation: time to the end of the first block (s). peak_memory: of the process (bytes).
         ratio: cost of the reference over the cost of this case.
         force_error, acceleration_error: largest difference below 2 kHz to the case ``truth``, over
             its largest deviation from the mean.
@@ -128,9 +123,6 @@ def scenario_of(case: Case) -> Scenario:
     """The scenario that a case runs."""
     scenario = load_scenario(case.scenario)
     first = scenario.train[0]
-    if case.train:
-        preset = train_preset(case.train, first.speed, first.start)
-        scenario = scenario.model_copy(update={"train": (preset,)})
     if case.cars:
         cars = first.model_copy(update={"vehicles": first.vehicles[:1] * case.cars, "preset": None})
         scenario = scenario.model_copy(update={"train": (cars,)})
@@ -152,19 +144,16 @@ def _run(case: Case, keep: bool) -> tuple[Result, _Signals | None]:
     begin = time.perf_counter()
     scenario = scenario_of(case)
     simulation = Simulation(scenario)
-    Simulation(scenario).advance(2)
-    preparation = time.perf_counter() - begin
     sensors = SensorArray(scenario, simulation.channels) if case.sensors else None
     step = simulation.step_ns * 1e-9
     total = simulation.end_index
-    if case.duration:
-        total = min(total, round(case.duration / step))
     forces, accelerations, on_line, done = [], [], 0, 0
-    start, before = time.process_time(), 0
+    start, before, preparation = time.process_time(), 0, math.nan
     while done < total:
         if done == BLOCK:
             # the first block pays for what is made once: profiles, tables
             start, before = time.process_time(), BLOCK
+            preparation = time.perf_counter() - begin
         block = simulation.advance(min(BLOCK, total - done))
         done += len(block.time)
         assert block.acceleration is not None

@@ -35,20 +35,17 @@ def bench(
     group: Annotated[
         list[str] | None, typer.Option("--group", "-g", help="Only these groups; may be repeated.")
     ] = None,
-    slow: Annotated[bool, typer.Option("--slow", help="Run the cases of several minutes too.")] = (
-        False
-    ),
 ) -> None:
     """Measure how fast runs are: cost against the paper's way, error, growth, memory.
 
     Every case runs on one core in a process of its own; costs are CPU time, preparation excluded.
-    Groups: accuracy, product, cars, spans, memory.
+    Groups: accuracy, product, cars, spans.
     """
     from trackvib_ros.bench import growth, load_cases, run_cases
 
     if output is not None and output.exists():
         raise InputError(f"{output} exists: name another file with -o")
-    cases = [case for case in load_cases() if slow or not case.slow]
+    cases = load_cases()
     known = sorted({case.group for case in cases})
     for name in group or ():
         if name not in known:
