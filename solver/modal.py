@@ -36,9 +36,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LANES = 16
-END_ZONE = 3.0
-"""Distance (m) from the ends of the line within which lost contacts are not counted."""
-
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 """Freedoms given to the compiler; not-a-number and infinity keep their meaning."""
 
@@ -584,9 +581,7 @@ def _march(  # type: ignore[no-untyped-def]
                 last_force[i] = force[n, i]
                 last_place[i] = position[n, i]
                 if 0.0 <= position[n, i] <= length:
-                    # the rail dips to its pinned ends faster than a wheelset can follow
-                    away = min(position[n, i], length - position[n, i]) > END_ZONE
-                    if away and touching[i] and force[n, i] <= 0.0:
+                    if touching[i] and force[n, i] <= 0.0:
                         lost += 1
                     touching[i] = force[n, i] > 0.0
                 else:
@@ -684,8 +679,7 @@ def march_reference(
                 + fleet.drive[t, :states, :count] @ new
                 + fleet.constant[t, :states]
             )
-            away = np.minimum(x, tables.length - x) > END_ZONE
-            lost += int((on & away & fleet.touching[axles] & (new <= 0)).sum())
+            lost += int((on & fleet.touching[axles] & (new <= 0)).sum())
             fleet.touching[axles] = np.where(on, new > 0, fleet.touching[axles])
             fleet.force[axles], fleet.place[axles] = new, x
             force[n, axles] = np.where(on, new, np.nan)

@@ -15,8 +15,8 @@ class QualityReport:
             by the static wheelset load (-).
         energy_residual: |work done - stored - dissipated| of the line, per work done or energy (-);
             None where the full matrices are not at hand (exponential steps).
-        lost_contacts: number of times a wheelset lifted off the line, the 3 m at both ends, where
-            the rail is held, left out; with the linear law, times the force became tensile.
+        lost_contacts: number of times a wheelset on the line lifted off; with the linear law, times
+            the force became tensile.
         valid_band: highest trustworthy frequency of every channel (Hz).
         notes: sentences on what limits the result.
     """
