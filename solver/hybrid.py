@@ -40,6 +40,9 @@ NEWMARK_PHASE = 0.346
 SPEED_RANGE = 2 ** (1 / 6)
 """Largest ratio of the speeds of a train on the line: a sixth octave."""
 
+KEPT_TABLES = 32
+"""Kinds of wheelsets whose local forces stay tabled, for further trains of that speed."""
+
 HALF_TAPS = 4
 """Samples of the global set on either side that make a sample in between.
 
@@ -109,6 +112,13 @@ class GlobalTraffic(Traffic):
         if train not in self._speeds:
             self._speeds[train] = line_speed(self.motions[train], self.length)
         return self._speeds[train]
+
+    def forget(self, trains: Sequence[int]) -> None:
+        """Drop trains, and what only they needed."""
+        super().forget(trains)
+        self._speeds = {k: v for k, v in self._speeds.items() if k in self.motions}
+        speeds = set(self._speeds.values())
+        self._parts = {k: v for k, v in self._parts.items() if k in speeds}
 
     def roughness(self, units: Sequence[Running], position: Real, time: Real) -> Real:
         """(n, A) m, as :meth:`Traffic.roughness` but without what is local."""
@@ -234,7 +244,7 @@ class HybridRun:
         )
         self._coarse_scenario = scenario.model_copy(update={"solution": coarse})
         for train in scenario.train:
-            self._check(train)
+            self.check(train)
         self._fine = traffic
         self._traffic = GlobalTraffic(self._coarse_scenario, self.crossover)
         self._run: ModalRun | NewmarkRun
@@ -248,7 +258,7 @@ class HybridRun:
         self._derivatives = derivatives
         self._coarse_done = 0
         self._next = 0
-        self._buffer_force = np.zeros((0, traffic.wheelsets))
+        self._buffer_force = np.zeros((0, len(traffic.wheelset_train)))
         self._buffer_signal = np.zeros((0, len(derivatives) * self._channels))
         self._local = np.zeros((0, len(derivatives), int(self.field.heard.sum())))
         self._local_first = 0
@@ -292,18 +302,26 @@ class HybridRun:
             f"the global set is stepped at {self.ratio} steps of the output",
         )
 
-    def reconsider(self) -> None:
-        """Take over trains that were added to the traffic."""
-        for motion in self._fine.motions[len(self._traffic.motions) :]:
-            self._check(motion.train)
-            self._traffic.add(motion.train, self._run.next_sample)
+    def arrange(self, trains: Sequence[int], departed: Sequence[int] = ()) -> None:
+        """Give columns to these trains, some of which may be new, and forget the departed."""
+        for index, motion in self._fine.motions.items():
+            if index not in self._traffic.motions:
+                self._traffic.add(motion.train, self._run.next_sample)
+        source = self._fine.arrange(trains)
+        self._fine.forget(departed)
+        self._run.arrange(trains, departed)
+        self._buffer_force = self._fine.rearranged(self._buffer_force, source)
         self._describe_wheels()
-        missing = self._fine.wheelsets - self._buffer_force.shape[1]
-        empty = np.full((len(self._buffer_force), missing), np.nan)
-        self._buffer_force = np.concatenate([self._buffer_force, empty], axis=1)
-        self._run.reconsider()
+        unused = [key for key in self._wheels if key not in self._columns]
+        for key in unused[: max(0, len(self._wheels) - KEPT_TABLES)]:
+            del self._wheels[key]
 
-    def _check(self, train: Train) -> None:
+    def check(self, train: Train) -> None:
+        """Refuse a train that the hybrid cannot run.
+
+        Raises:
+            InputError: see :class:`HybridRun`.
+        """
         motion = TrainMotion(train)
         speed = line_speed(motion, self.scenario.line.length)
         if train.flat:
@@ -327,6 +345,8 @@ class HybridRun:
         profile = self._traffic.full_profile
         self._columns = []
         for running in self._traffic.running:
+            if running.train not in self._traffic.arranged:
+                continue
             motion = self._traffic.motions[running.train]
             speed = self._traffic.speed(running.train)
             loads = running.unit.static_loads

@@ -18,7 +18,7 @@ changes of the other forces in the same step are left out: they are second order
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -793,8 +793,13 @@ class ModalRun:
         """First sample that is not computed yet."""
         return self._next
 
-    def reconsider(self) -> None:
-        """Look for units that start, because a train was added."""
+    def arrange(self, trains: Sequence[int], departed: Sequence[int] = ()) -> None:
+        """Give columns to these trains, some of which may be new, and forget the departed."""
+        source = self.traffic.arrange(trains)
+        self.traffic.forget(departed)
+        if self._held:
+            self._held[1] = self.traffic.position(self._held[0])
+            self._held[2] = self.traffic.rearranged(self._held[2], source)
         self._until = 0
 
     def advance(self, samples: int) -> tuple[Array, Array, Array, Array]:
@@ -810,15 +815,8 @@ class ModalRun:
         """
         first = self._next == 0
         ahead = self._march_on(samples + 2 if first else samples)
-        held = list(self._held)
-        if first:
-            # at rest before the start
-            held = [np.repeat(part[:1], 2, axis=0) for part in ahead]
-        elif held[1].shape[1] != ahead[1].shape[1]:
-            # a train was added in between
-            held[1] = self.traffic.position(held[0])
-            more = ahead[2].shape[1] - held[2].shape[1]
-            held[2] = np.pad(held[2], ((0, 0), (0, more)), constant_values=np.nan)
+        # at rest before the start
+        held = [np.repeat(part[:1], 2, axis=0) for part in ahead] if first else self._held
         time, position, force, outputs, answer = (
             np.concatenate(parts) for parts in zip(held, ahead, strict=True)
         )

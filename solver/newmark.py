@@ -9,6 +9,7 @@ for the line (sparse, factored once) and for every unit, joined by the contact f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,8 +127,10 @@ class NewmarkRun:
         """First sample that is not computed yet."""
         return self._next
 
-    def reconsider(self) -> None:
-        """Look for units that start, because a train was added."""
+    def arrange(self, trains: Sequence[int], departed: Sequence[int] = ()) -> None:
+        """Give columns to these trains, some of which may be new, and forget the departed."""
+        self.traffic.arrange(trains)
+        self.traffic.forget(departed)
         self._until = 0
 
     @property
@@ -301,6 +304,7 @@ class NewmarkRun:
         self._units = active
         self._force = np.concatenate([np.zeros(0), *(forces[id(unit)] for unit in active)])
         self._cars = {id(unit): self._cars[id(unit)] for unit in active}
+        self._touching = {id(unit): self._touching[id(unit)] for unit in active}
 
     def _settle(
         self, fresh: list[Running], position: Array, time: float, forces: dict[int, Array]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,6 +30,9 @@ OUTPUTS: tuple[Output, ...] = ("displacement", "velocity", "acceleration")
 CONTACT_PHASE = 0.5
 """Largest phase (rad) of a wheelset on its contact springs in one step."""
 
+LOOK_AHEAD = 0.5
+"""Time (s) before a train runs in at which it gets its columns: no run computes further ahead."""
+
 SETTLE_TIME = 3.0
 """Time (s) that a run of unstated end goes on after the last wheelset has left the line."""
 
@@ -41,7 +44,10 @@ class Block:
     Attributes:
         index: number of the first sample since t = 0.
         time: (n,) s.
-        wheelset_position: (n, W) m, all wheelsets of all trains in order of ``scenario.train``.
+        wheelset_train: (W,) index of the train of every wheelset: trains count in the order of
+            ``scenario.train``, then as they are added.
+        wheelset_number: (W,) number of the wheelset in its train, from 1.
+        wheelset_position: (n, W) m, all wheelsets of the trains that have columns.
         wheelset_force: (n, W) N, both wheels of a wheelset on the rails; NaN off the line.
         displacement: (n, C) m, positive down, solver rate, unfiltered; None when not asked for.
             Channels of strain (-) or force (N) give their value here.
@@ -51,6 +57,8 @@ class Block:
 
     index: int
     time: Array
+    wheelset_train: NDArray[np.intp]
+    wheelset_number: NDArray[np.intp]
     wheelset_position: Array
     wheelset_force: Array
     displacement: Array | None
@@ -66,13 +74,16 @@ class Simulation:
     Args:
         scenario: what to run.
         outputs: which derivatives of the channel signals the blocks carry.
+        columns: which trains have columns in the blocks: ``all``, for the whole run, so that blocks
+            can be joined; or those ``present``, within half a second of the block or nearer, and a
+            train that has left is forgotten, so that a run without end keeps its cost and memory.
         report: called with one-line messages on what is being prepared.
 
     Raises:
         InputError: the scenario asks for what cannot be run.
 
     Attributes:
-        scenario: the scenario, trains added at run time included.
+        scenario: the scenario, without trains added at run time.
         step_ns: time step (ns).
         channels: channel names, one per column of the block's signals.
     """
@@ -82,6 +93,7 @@ class Simulation:
         scenario: Scenario,
         *,
         outputs: Sequence[Output] = ("acceleration",),
+        columns: Literal["all", "present"] = "all",
         report: Callable[[str], None] | None = None,
     ) -> None:
         tell = report or (lambda message: None)
@@ -90,6 +102,7 @@ class Simulation:
         self.channels = tuple(channel.name for channel in scenario.channel)
         self._outputs: tuple[Output, ...] = tuple(name for name in OUTPUTS if name in outputs)
         self._traffic = Traffic(scenario)
+        self._forgets = columns == "present"
         self._index = 0
         _check_step(scenario)
         for train in scenario.train:
@@ -106,8 +119,8 @@ class Simulation:
         tell(f"{self.states} modes; compiling or loading the stepping kernel")
 
     @property
-    def motions(self) -> list[TrainMotion]:
-        """Kinematics of every train."""
+    def motions(self) -> Mapping[int, TrainMotion]:
+        """Kinematics of every train that is not forgotten, by its index."""
         return self._traffic.motions
 
     @property
@@ -129,12 +142,6 @@ class Simulation:
         return self._run.ratio
 
     @property
-    def train_of_wheelset(self) -> NDArray[np.intp]:
-        """(W,) index into ``scenario.train`` of every wheelset."""
-        counts = [len(motion.offsets) for motion in self.motions]
-        return np.repeat(np.arange(len(counts)), counts)
-
-    @property
     def quality(self) -> QualityReport:
         """How far the samples so far can be trusted."""
         run = self._run
@@ -154,6 +161,8 @@ class Simulation:
             SolverError: the computation left its valid range.
         """
         index = self._index
+        if self._forgets:
+            self._rearrange(samples)
         time, position, force, signals = self._run.advance(samples)
         self._index += samples
         width = len(self.channels)
@@ -163,12 +172,21 @@ class Simulation:
         return Block(
             index=index,
             time=time,
+            wheelset_train=self._traffic.wheelset_train,
+            wheelset_number=self._traffic.wheelset_number,
             wheelset_position=position,
             wheelset_force=force,
             displacement=parts.get("displacement"),
             velocity=parts.get("velocity"),
             acceleration=parts.get("acceleration"),
         )
+
+    def _rearrange(self, samples: int) -> None:
+        """Columns for the trains near the line in the next samples; the departed are forgotten."""
+        ahead = math.ceil(LOOK_AHEAD / (self.step_ns * 1e-9))
+        present = self._traffic.present(self._index, self._index + samples + ahead)
+        if present != self._traffic.arranged:
+            self._run.arrange(present, self._traffic.departed(self._index))
 
     def blocks(self, samples: int = 800) -> Iterator[Block]:
         """Blocks of ``samples`` samples to ``end_index``; the last one may be shorter."""
@@ -178,7 +196,7 @@ class Simulation:
     def add_train(self, train: Train, start_time: float) -> int:
         """Add a train that is at ``train.start`` at ``start_time`` (s); returns its index.
 
-        Its wheelsets are columns of the blocks from the next one on.
+        Its wheelsets may be columns of the blocks from the next one on.
 
         Raises:
             InputError: a wheelset would appear on the line out of nowhere.
@@ -197,9 +215,10 @@ class Simulation:
                 f"{place[axle]:.6g} m, on the line of {self.scenario.line.length:g} m already: "
                 "choose a later start_time or a start farther away"
             )
+        if isinstance(self._run, HybridRun):
+            self._run.check(train)
         index = self._traffic.add(train, self._run.next_sample)
-        self.scenario = self.scenario.model_copy(update={"train": (*self.scenario.train, train)})
-        self._run.reconsider()
+        self._run.arrange((*self._traffic.arranged, index))
         return index
 
 

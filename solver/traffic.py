@@ -31,25 +31,27 @@ END_ZONE = 4.0
 laid so that its loaded level stays even; faded out over its inner half."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Running:
     """A unit of a train with the samples in which it is stepped.
 
     Attributes:
         unit, train: the unit and the index of its train.
         kind: number that is equal for units with equal matrices.
-        columns: columns of its wheelsets among all wheelsets.
+        axles: its wheelsets among those of its train.
         law: (2, A) contact law of its wheelsets.
         start, end: first sample, and first sample after it has left the line.
+        columns: its wheelsets among those that have a column, see :meth:`Traffic.arrange`.
     """
 
     unit: Unit
     train: int
     kind: int
-    columns: slice
+    axles: slice
     law: Array
     start: int
     end: int
+    columns: slice
 
 
 class Traffic:
@@ -60,28 +62,40 @@ class Traffic:
 
     Raises:
         InputError: a wheelset would cross a free end of the line.
+
+    Attributes:
+        motions: kinematics of every train by its index, which counts trains as they are added.
+        running: their units.
+        arranged: indices of the trains whose wheelsets have columns, in order of the columns.
+        wheelset_train, wheelset_number: (W,) index of the train, and number in it from 1, of every
+            column.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.length = scenario.line.length
         self.step = scenario.solution.step_ns * 1e-9
-        self.motions: list[TrainMotion] = []
+        self.motions: dict[int, TrainMotion] = {}
         self.running: list[Running] = []
-        self.wheelsets = 0
+        self.arranged: tuple[int, ...] = ()
+        self.wheelset_train: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
+        self.wheelset_number: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
+        self._added = 0
+        self._last_exit = 0
         self._kinds: list[Unit] = []
         self._profile: Profile | None = None
         self._reach = 0.0
         self._zone: Array = np.zeros(0)
         self._rise: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
-        self._crossed: dict[int, tuple[bool, bool]] = {}
+        self._crossed: dict[tuple[int, int], tuple[bool, bool]] = {}
         for train in scenario.train:
             self.add(train)
+        self.arrange(tuple(self.motions))
 
     def add(self, train: Train, now: int = 0) -> int:
         """Add a train whose units may start at sample ``now`` or later; returns its index."""
         motion = TrainMotion(train)
-        index, first = len(self.motions), 0
+        index, first = self._added, 0
         entry, way_out = (0.0, self.length) if motion.sign > 0 else (self.length, 0.0)
         starts = motion.axle_times(entry - motion.sign * RUN_IN)
         ends = motion.axle_times(way_out)
@@ -95,19 +109,68 @@ class Traffic:
                     unit=unit,
                     train=index,
                     kind=self._kind(unit),
-                    columns=slice(self.wheelsets + first, self.wheelsets + last + 1),
+                    axles=slice(first, last + 1),
                     law=np.array(law).T,
                     start=max(now, math.ceil(starts[first] / self.step)),
                     end=math.floor(ends[last] / self.step) + 1,
+                    columns=slice(0, 0),
                 )
             )
-            span = float(motion.offsets[last] - motion.offsets[first])
-            self._reach = max(self._reach, RUN_IN + span + 1.0)
+            self._last_exit = max(self._last_exit, self.running[-1].end)
+            reach = RUN_IN + float(motion.offsets[last] - motion.offsets[first]) + 1.0
+            if reach > self._reach:
+                self._reach, self._profile = reach, None
             first = last + 1
-        self.motions.append(motion)
-        self.wheelsets += first
-        self._profile = None
+        self.motions[index] = motion
+        self._added += 1
         return index
+
+    def arrange(self, trains: Sequence[int]) -> NDArray[np.intp]:
+        """Give columns to the wheelsets of just these trains, in this order.
+
+        Returns:
+            (W,) column that every new column was before, -1 if there was none.
+        """
+        before = {index: column for column, index in enumerate(self._columns_of(self.arranged))}
+        places = self._columns_of(trains)
+        self.arranged = tuple(trains)
+        self.wheelset_train = np.array([train for train, _ in places], dtype=np.intp)
+        self.wheelset_number = np.array([axle + 1 for _, axle in places], dtype=np.intp)
+        first = {train: places.index((train, 0)) for train in self.arranged}
+        for unit in self.running:
+            start = first.get(unit.train)
+            unit.columns = (
+                slice(0, 0)
+                if start is None
+                else slice(start + unit.axles.start, start + unit.axles.stop)
+            )
+        return np.array([before.get(place, -1) for place in places], dtype=np.intp)
+
+    def _columns_of(self, trains: Sequence[int]) -> list[tuple[int, int]]:
+        return [
+            (index, axle) for index in trains for axle in range(len(self.motions[index].offsets))
+        ]
+
+    def present(self, first: int, last: int) -> tuple[int, ...]:
+        """Indices of the trains with a unit that is stepped between two samples."""
+        near = {unit.train for unit in self.running if unit.start <= last and unit.end > first}
+        return tuple(sorted(near))
+
+    def rearranged(self, values: Array, source: NDArray[np.intp]) -> Array:
+        """(n, W) values by column as they are after :meth:`arrange`; NaN in new columns."""
+        return np.where(source >= 0, np.pad(values, ((0, 0), (0, 1)))[:, source], np.nan)
+
+    def departed(self, sample: int) -> tuple[int, ...]:
+        """Indices of the trains that are off the line from a sample on, for good."""
+        coming = {unit.train for unit in self.running if unit.end > sample}
+        return tuple(index for index in self.motions if index not in coming)
+
+    def forget(self, trains: Sequence[int]) -> None:
+        """Drop trains that have no columns and will have none any more."""
+        for index in trains:
+            del self.motions[index]
+        self.running = [unit for unit in self.running if unit.train in self.motions]
+        self._crossed = {k: v for k, v in self._crossed.items() if k[0] in self.motions}
 
     def _kind(self, unit: Unit) -> int:
         for index, other in enumerate(self._kinds):
@@ -163,11 +226,11 @@ class Traffic:
         zone = self._zone[-1]
         if zone <= position.min() and position.max() <= self.length - zone:
             return 0.0
-        number = running.columns.start + axle
-        if number not in self._crossed:
-            self._crossed[number] = self._ends_crossed(running, axle)
+        wheelset = running.train, running.axles.start + axle
+        if wheelset not in self._crossed:
+            self._crossed[wheelset] = self._ends_crossed(running, wheelset[1])
         surface = np.zeros_like(position)
-        left, right = self._crossed[number]
+        left, right = self._crossed[wheelset]
         if left:
             surface += np.interp(position, self._zone, self._rise[0])
         if right:
@@ -176,11 +239,10 @@ class Traffic:
 
     def _ends_crossed(self, running: Running, axle: int) -> tuple[bool, bool]:
         motion, end_time = self.motions[running.train], self.scenario.solution.end_time
-        column = running.columns.start - self._first_column(running.train) + axle
-        first = motion.position(np.array([running.start * self.step]))[0, column]
+        first = motion.position(np.array([running.start * self.step]))[0, axle]
         last = math.inf * motion.sign
         if end_time is not None:
-            last = motion.position(np.array([end_time]))[0, column]
+            last = motion.position(np.array([end_time]))[0, axle]
         return min(first, last) < 0, max(first, last) > self.length
 
     @property
@@ -199,13 +261,12 @@ class Traffic:
 
     def last_exit(self) -> float:
         """Time (s) at which the last wheelset leaves the line; 0 without trains."""
-        return max((unit.end * self.step for unit in self.running), default=0.0)
+        return self._last_exit * self.step
 
     def position(self, time: Array) -> Array:
-        """(n, W) m, all wheelsets at times (n,) s."""
-        if not self.motions:
-            return np.zeros((len(time), 0))
-        return np.concatenate([motion.position(time) for motion in self.motions], axis=1)
+        """(n, W) m, all wheelsets that have columns, at times (n,) s."""
+        places = [self.motions[index].position(time) for index in self.arranged]
+        return np.concatenate([np.zeros((len(time), 0)), *places], axis=1)
 
     def roughness(self, units: Sequence[Running], position: Array, time: Array) -> Array:
         """(n, A) m: irregularity, wheel defects and end surfaces under the wheelsets of ``units``.
@@ -224,9 +285,8 @@ class Traffic:
         for running in units:
             motion = self.motions[running.train]
             train = motion.train
-            first = running.columns.start - self._first_column(running.train)
             for axle in range(len(running.unit.wheelsets)):
-                number = first + axle + 1
+                number = running.axles.start + axle + 1
                 flats = [flat.length for flat in train.flat if flat.wheelset == number]
                 waves = [wave for wave in train.polygon if wave.wheelset == number]
                 radius = float(running.unit.wheel_radius[axle])
@@ -242,6 +302,3 @@ class Traffic:
                     )
                 column += 1
         return values
-
-    def _first_column(self, train: int) -> int:
-        return sum(len(motion.offsets) for motion in self.motions[:train])

@@ -270,8 +270,8 @@ def scenario_of(case: Case, root: Path = Path()) -> Scenario:
 
 def _truths(simulation: Simulation) -> list[PassageTruth]:
     return [
-        PassageTruth.of(motion, number, simulation.scenario)
-        for number, motion in enumerate(simulation.motions, 1)
+        PassageTruth.of(motion, index + 1, simulation.scenario)
+        for index, motion in simulation.motions.items()
     ]
 
 

@@ -124,7 +124,7 @@ class Run:
     def trigger(self, preset: str | None, speed: float | None) -> int:
         """Send a train now; see :meth:`Station.trigger`."""
         number = self.station.trigger(preset, speed)
-        self._open_wheel_forces(self.station.simulation.scenario.train[number - 1])
+        self._open_wheel_forces(self.station.simulation.motions[number - 1].train)
         return number
 
     def advance(self) -> float:

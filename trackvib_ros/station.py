@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from solver import Scenario, Simulation, Train, train_preset
+from solver import Block, Scenario, Simulation, Train, train_preset
 from trackvib_ros.sensor import UP, SensorArray
 from trackvib_ros.truth import PassageTruth
 from trackvib_ros.waveform import Waveform
@@ -102,13 +101,15 @@ class Station:
     ) -> None:
         self.scenario = scenario
         self.sensors = SensorArray(scenario, [channel.name for channel in scenario.channel])
-        self.simulation = Simulation(scenario, outputs=("acceleration",), report=report)
+        self.simulation = Simulation(
+            scenario, outputs=("acceleration",), columns="present", report=report
+        )
         self._samples = max(2, round(STEP_S * 1e9 / self.simulation.step_ns))
         self._index = self._computed = 0
         self._headway, self._least_headway = headway, least_headway
         self._random = np.random.default_rng([scenario.irregularity.seed, 0x7264])
         self._next_train_ns = self._draw_headway(0)
-        self._known = 0
+        self._known = -1
         self._coming: list[tuple[int, int, PassageTruth]] = []
         self._present: list[PassageTruth] = []
         # the first step loads the compiled kernel for seconds: better now than while running
@@ -190,7 +191,7 @@ class Station:
             "line",
         )
         entered = self._admit()
-        force, wheelsets = self._wheelsets(start_ns, block.wheelset_position, block.wheelset_force)
+        force, wheelsets = self._wheelsets(start_ns, block)
         return StationStep(
             time_ns=self._computed_ns,
             start_ns=start_ns,
@@ -203,14 +204,13 @@ class Station:
         )
 
     def _wheelsets(
-        self, start_ns: int, position: NDArray[np.float64], force: NDArray[np.float64]
+        self, start_ns: int, block: Block
     ) -> tuple[Waveform | None, list[WheelsetState]]:
+        position, force = block.wheelset_position, block.wheelset_force
         touching = np.flatnonzero(np.isfinite(force).any(axis=0))
         if touching.size == 0:
             return None, []
-        train_of = self.simulation.train_of_wheelset
-        first = np.searchsorted(train_of, train_of[touching])
-        trains, numbers = train_of[touching] + 1, touching - first + 1
+        trains, numbers = block.wheelset_train[touching] + 1, block.wheelset_number[touching]
         names = tuple(f"train_{k}_wheelset_{n}" for k, n in zip(trains, numbers, strict=True))
         wave = Waveform(
             start_ns,
@@ -228,11 +228,11 @@ class Station:
 
     def _admit(self) -> list[PassageTruth]:
         """Look at new trains, let those on the line in and those past it go; the ones let in."""
-        motions = self.simulation.motions
-        for index in range(self._known, len(motions)):
-            passage = PassageTruth.of(motions[index], index + 1, self.scenario)
-            heapq.heappush(self._coming, (passage.enter_ns, index, passage))
-        self._known = len(motions)
+        for index, motion in self.simulation.motions.items():
+            if index > self._known:
+                passage = PassageTruth.of(motion, index + 1, self.scenario)
+                heapq.heappush(self._coming, (passage.enter_ns, index, passage))
+                self._known = index
         entered = []
         while self._coming and self._coming[0][0] < self._computed_ns:
             passage = heapq.heappop(self._coming)[2]

@@ -184,8 +184,9 @@ def test_two_trains_meet_and_a_third_is_added():
     first = simulation.advance(1000)
     assert first.wheelset_force.shape == (1000, 2)
     assert simulation.add_train(known.train[0], start_time=0.1) == 2
-    assert list(simulation.train_of_wheelset) == [0, 1, 2]
     rest = simulation.advance(7000)
+    assert list(rest.wheelset_train) == [0, 1, 2]
+    assert list(rest.wheelset_number) == [1, 1, 1]
     np.testing.assert_allclose(rest.wheelset_position, whole.wheelset_position[1000:])
     on = np.isfinite(rest.wheelset_force[:, 2])
     np.testing.assert_array_equal(on, np.isfinite(whole.wheelset_force[1000:, 2]))

@@ -88,7 +88,7 @@ def simulate_to_file(
     down, unfiltered, solver rate), ``channels``, ``step_ns``, ``scenario`` (TOML text).
     """
     samples, channels = simulation.end_index, len(simulation.channels)
-    wheelsets = len(simulation.train_of_wheelset)
+    wheelsets = sum(len(train.axle_positions) for train in simulation.scenario.train)
     task = progress.add_task("simulate", total=samples) if progress else None
     with _own_folder(output) as folder:
         columns = {
