@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -36,6 +37,9 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LANES = 16
+TILE = 400
+"""Most modes that are taken through a whole step at a time, so that they stay cached."""
+
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 """Freedoms given to the compiler; not-a-number and infinity keep their meaning."""
 
@@ -75,36 +79,63 @@ def exponential_weights(eigenvalues: Complex, step: float, order: int) -> tuple[
 class ModalTables:
     """A :class:`ModalLine` made ready for one step length.
 
-    K is padded with zeros to a multiple of 16; weights are folded into the shapes as square roots.
+    Modes are cut into Z tiles of T, a multiple of 16, padded with zeros. Weights are folded into
+    the shapes as square roots.
 
     Attributes:
-        shapes: (cells, 8, K) re and im of the four cubic coefficients of the rail shapes.
-        decay, drive: (2, K) re and im of E and d.
-        predict: (4, K) re and im of a and of -c/E.
+        shapes: (Z, cells, 4, 2 T) cubic coefficients of the rail shapes, re then im.
+        decay, drive: (Z, 2, T) re and im of E and d.
+        now, recall: (Z, 2, T) re and im of a and -c/E.
         compliance: (2, cells, 4) m/N, cubic coefficients: displacement of the modes at a wheelset
             per its new force; residual compliance.
-        channel_weights: (O, 2K) output = channel_weights @ (re, -im of y) + feed-through.
+        channel_weights: (O, Z 2 T) output = channel_weights @ (re, -im of y) + feed-through.
         channel_feed: (2, cells, 4, O) cubic coefficients of the feed-through per new, last force.
-        start_weights: (2, K) complex: y before sample 0 = start_weights[0] p for a static p.
+        start_weights: (K,) complex: y before sample 0 = start_weights p for a static p.
         grid_start, grid_step, length: m.
     """
 
     shapes: NDArray[np.floating]
     decay: Array
     drive: Array
-    predict: Array
+    now: Array
+    recall: Array
     compliance: Array
-    channel_weights: Array
+    channel_weights: NDArray[np.floating]
     channel_feed: Array
     start_weights: Complex
     grid_start: float
     grid_step: float
     length: float
 
-    @property
-    def size(self) -> int:
-        """Padded number of modes."""
-        return int(self.decay.shape[1])
+    def pack(self, values: Complex) -> Any:
+        """(K,) values of the modes in tiles, (Z, 2, T)."""
+        return _pack(values, len(self.decay))
+
+    def unpack(self, tiles: NDArray[np.floating]) -> Complex:
+        """(K,) complex values of tiles (Z, 2, T) or (Z, 2 T)."""
+        parts = tiles.astype(np.float64).reshape(self.decay.shape)
+        whole: Complex = (parts[:, 0] + 1j * parts[:, 1]).ravel()
+        return whole[: len(self.start_weights)]
+
+
+def aligned(shape: tuple[int, ...], precision: np.dtype | type[np.floating]) -> Any:
+    """Zeros that begin on a line of the cache, which vectors then never straddle."""
+    size = math.prod(shape) * np.dtype(precision).itemsize
+    memory = np.zeros(size + 64, dtype=np.uint8)
+    begin = -memory.ctypes.data % 64
+    return memory[begin : begin + size].view(precision).reshape(shape)
+
+
+def _pack(values: Complex, tiles: int, precision: type[np.floating] = np.float64) -> Any:
+    """Modes on the last axis, (..., K), cut into tiles: (..., Z, 2, T)."""
+    *others, modes = values.shape
+    size = -(-modes // (tiles * LANES)) * LANES
+    padded = np.zeros((*others, tiles * size), dtype=np.complex128)
+    padded[..., :modes] = values
+    cut = padded.reshape(*others, tiles, size)
+    packed = aligned((*others, tiles, 2, size), precision)
+    packed[..., 0, :], packed[..., 1, :] = cut.real, cut.imag
+    return packed
 
 
 def modal_tables(
@@ -122,10 +153,10 @@ def modal_tables(
         step: time step (s).
         derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
         order: 1 or 2, interpolation of the forces in time.
-        precision: of the rail shapes.
+        precision: of the shapes of rail and channels.
     """
     modes = len(line.eigenvalues)
-    size = -(-modes // LANES) * LANES
+    tiles = -(-modes // TILE)
     root = np.sqrt(line.weights)
     cells = len(line.rail_shapes)
     shapes = line.rail_shapes * root
@@ -133,14 +164,11 @@ def modal_tables(
     decay, now, last, before = exponential_weights(lam, step, order)
     recall = -before / decay
 
-    packed = np.zeros((cells, 8, size), dtype=precision)
-    packed[:, 0::2, :modes] = shapes.real
-    packed[:, 1::2, :modes] = shapes.imag
-
-    def split(values: Complex) -> Array:
-        out = np.zeros((2, size))
-        out[0, :modes], out[1, :modes] = values.real, values.imag
-        return out
+    size = 2 * _pack(lam, tiles).shape[2]
+    packed = aligned((tiles, cells, 4, size), precision)
+    for power in range(4):
+        part = _pack(shapes[:, power], tiles, precision)
+        packed[:, :, power] = part.reshape(cells, tiles, size).swapaxes(0, 1)
 
     ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
     slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
@@ -155,26 +183,23 @@ def modal_tables(
         direct = channel * lam if derivative == 2 else 0.0 * channel
         feeds.append(((observe * now + direct).T, (observe * recall).T))
     outputs = len(derivatives) * len(channel)
-    channel_weights = np.zeros((outputs, 2 * size))
+    channel_weights = aligned((outputs, tiles * size), precision)
     channel_feed = np.zeros((2, cells, 4, outputs))
     if outputs:
-        stacked = np.concatenate(weights)
-        channel_weights[:, :modes] = stacked.real
-        channel_weights[:, size : size + modes] = stacked.imag
+        channel_weights[:] = _pack(np.concatenate(weights), tiles).reshape(outputs, -1)
         for row in range(2):
             matrix = np.concatenate([feed[row] for feed in feeds], axis=1)
             channel_feed[row] = (shapes.reshape(-1, modes) @ matrix).real.reshape(cells, 4, outputs)
-    start = np.zeros(size, dtype=np.complex128)
-    start[:modes] = -1 / lam - now - recall
     return ModalTables(
         shapes=packed,
-        decay=split(decay),
-        drive=split(decay * now + last - recall),
-        predict=np.concatenate([split(now), split(recall)]),
+        decay=_pack(decay, tiles),
+        drive=_pack(decay * now + last - recall, tiles),
+        now=_pack(now, tiles),
+        recall=_pack(recall, tiles),
         compliance=np.stack([own, line.residual]),
         channel_weights=channel_weights,
         channel_feed=channel_feed,
-        start_weights=start,
+        start_weights=-1 / lam - now - recall,
         grid_start=line.grid_start,
         grid_step=line.grid_step,
         length=line.length,
@@ -189,7 +214,7 @@ class Fleet:
 
     Attributes:
         kind: (U,) index into the matrices. first: (U + 1,) first axle of each unit.
-        transition: (T, S, S). drive: (T, S, A). constant: (T, S).
+        transition: (T, S, S) of column to row. drive: (T, A, S). constant: (T, S).
         now, before: (T, A, A) m/N, wheelset displacement per new and last forces.
         wheelsets: (T, A) index of the wheelset displacements. states: (T,) length of the state.
         linear, hertz: (W,) contact law of every axle.
@@ -234,13 +259,13 @@ def build_fleet(
     kinds, most = len(steps), max((len(step.constant) for step in steps), default=0)
     axles = max((len(indices) for indices in wheelsets), default=0)
     transition = np.zeros((kinds, most, most))
-    drive, constant = np.zeros((kinds, most, axles)), np.zeros((kinds, most))
+    drive, constant = np.zeros((kinds, axles, most)), np.zeros((kinds, most))
     now, before = np.zeros((kinds, axles, axles)), np.zeros((kinds, axles, axles))
     where = np.zeros((kinds, axles), dtype=np.int64)
     for i, (step, indices) in enumerate(zip(steps, wheelsets, strict=True)):
         n, a = len(step.constant), len(indices)
-        transition[i, :n, :n] = step.transition
-        drive[i, :n, :a], constant[i, :n] = step.drive, step.constant
+        transition[i, :n, :n] = step.transition.T
+        drive[i, :a, :n], constant[i, :n] = step.drive.T, step.constant
         now[i, :a, :a], before[i, :a, :a] = step.now[indices], step.before[indices]
         where[i, :a] = indices
     padded = np.zeros((len(kind), most))
@@ -269,7 +294,7 @@ def build_fleet(
 def march(
     tables: ModalTables,
     modal: Array,
-    load: Array,
+    load: NDArray[np.floating],
     fleet: Fleet,
     position: Array,
     roughness: Array,
@@ -280,8 +305,8 @@ def march(
 
     Args:
         tables: of the line.
-        modal: (2K,) re and -im of the state y, overwritten.
-        load: (2K,) re and im of p at the last sample, overwritten.
+        modal: (Z, 2, T) re and -im of the state y, overwritten.
+        load: (Z, 2, T) re and im of p at the last sample, overwritten.
         fleet: units on or near the line; their state is overwritten.
         position: (n, W) m of the fleet's axles.
         roughness: (n, W) m, irregularity plus wheel defects under them.
@@ -291,12 +316,14 @@ def march(
     Returns:
         number of times an axle lost contact on the line, largest equilibrium residual (N).
     """
-    width, axles = len(modal), position.shape[1]
+    axles, precision = position.shape[1], tables.shapes.dtype
+    tiles, _, size = tables.decay.shape
     lost, residual = _march(
-        tables.shapes.reshape(len(tables.shapes), -1),
+        tables.shapes,
         tables.decay,
         tables.drive,
-        tables.predict,
+        tables.now,
+        tables.recall,
         tables.compliance,
         tables.channel_weights,
         tables.channel_feed,
@@ -305,9 +332,10 @@ def march(
         tables.length,
         modal,
         load,
-        np.empty((axles, width), dtype=tables.shapes.dtype),
-        np.empty((2, width)),
-        np.empty((min(CHUNK, len(position)), width)),
+        aligned((tiles, axles + 1, 2 * size), precision),
+        aligned((2, size), precision),
+        aligned((2, size), precision),
+        aligned((CHUNK, tiles, 2 * size), precision),
         fleet.kind,
         fleet.first,
         fleet.transition,
@@ -323,8 +351,6 @@ def march(
         fleet.force,
         fleet.place,
         fleet.touching,
-        np.empty(axles),
-        np.empty(axles),
         np.empty(fleet.state.shape[1]),
         position,
         roughness,
@@ -334,118 +360,147 @@ def march(
     return int(lost), float(residual)
 
 
-CHUNK = 32
+CHUNK = 8
 """Samples of the modes that are kept until the channels are read, so that they stay cached."""
 
 KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
 
-# Slices, not offsets, in the innermost loops: indices that might be negative are not vectorised.
+# Arrays come whole, with the tile as an index: making a slice costs as much as 100 modes here.
 @njit(**KERNEL)
-def _shape_at(c0, c1, c2, c3, s, shape):  # type: ignore[no-untyped-def]
-    """Rail shapes at s in a cell, re and im in a row."""
-    for k in range(shape.size):
-        shape[k] = c0[k] + s * (c1[k] + s * (c2[k] + s * c3[k]))
-
-
-@njit(**KERNEL)
-def _add_four(a, b, c, d, f0, f1, f2, f3, load):  # type: ignore[no-untyped-def]
-    for k in range(load.size):
-        load[k] += f0 * a[k] + f1 * b[k] + f2 * c[k] + f3 * d[k]
-
-
-@njit(**KERNEL)
-def _add_one(a, f, load):  # type: ignore[no-untyped-def]
-    for k in range(load.size):
-        load[k] += f * a[k]
-
-
-@njit(**KERNEL)
-def _step_modes(  # type: ignore[no-untyped-def]
-    decay_re, decay_im, drive_re, drive_im, load_re, load_im, re, im
-):
-    """y = E y + d p; im holds -im of y, so that a real part is a plain scalar product."""
-    for k in range(re.size):
-        x, y, p, q = re[k], im[k], load_re[k], load_im[k]
-        re[k] = decay_re[k] * x + decay_im[k] * y + drive_re[k] * p - drive_im[k] * q
-        im[k] = decay_re[k] * y - decay_im[k] * x - drive_re[k] * q - drive_im[k] * p
-
-
-@njit(**KERNEL)
-def _sum_loads(shape, pushing, pushed, force, load):  # type: ignore[no-untyped-def]
-    """Sum of shapes times forces over the wheelsets that push."""
-    load[:] = 0.0
-    m = 0
-    while m + 3 < pushed:
-        a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
-        _add_four(
-            shape[a], shape[b], shape[c], shape[d], force[a], force[b], force[c], force[d], load
+def _shape_at(shapes, t, cell, s, shape, i):  # type: ignore[no-untyped-def]
+    """Rail shapes of tile t at s in a cell."""
+    for k in range(shape.shape[2]):
+        shape[t, i, k] = shapes[t, cell, 0, k] + s * (
+            shapes[t, cell, 1, k] + s * (shapes[t, cell, 2, k] + s * shapes[t, cell, 3, k])
         )
-        m += 4
-    while m < pushed:
-        _add_one(shape[pushing[m]], force[pushing[m]], load)
-        m += 1
 
 
 @njit(**KERNEL)
-def _predict(  # type: ignore[no-untyped-def]
-    now_re, now_im, last_re, last_im, guess_re, guess_im, load_re, load_im, re, im, out_re, out_im
-):
-    """q = y + a p - (c/E) p' with p guessed; out_im holds -im of q."""
-    for k in range(re.size):
-        p, q, r, s = guess_re[k], guess_im[k], load_re[k], load_im[k]
-        out_re[k] = re[k] + now_re[k] * p - now_im[k] * q + last_re[k] * r - last_im[k] * s
-        out_im[k] = im[k] - now_re[k] * q - now_im[k] * p - last_re[k] * s - last_im[k] * r
+def _add_four(shape, t, a, b, c, d, f0, f1, f2, f3, load, row):  # type: ignore[no-untyped-def]
+    for k in range(load.shape[1]):
+        load[row, k] += (
+            f0 * shape[t, a, k] + f1 * shape[t, b, k] + f2 * shape[t, c, k] + f3 * shape[t, d, k]
+        )
 
 
 @njit(**KERNEL)
-def _dot_four(weights, a, b, c, d):  # type: ignore[no-untyped-def]
-    p, q, r, s = 0.0, 0.0, 0.0, 0.0
-    for k in range(weights.size):
-        p += weights[k] * a[k]
-        q += weights[k] * b[k]
-        r += weights[k] * c[k]
-        s += weights[k] * d[k]
+def _sum_loads(shape, t, pushing, pushed, force, load, row):  # type: ignore[no-untyped-def]
+    """Sum of shapes times forces over the wheelsets that push."""
+    for k in range(load.shape[1]):
+        load[row, k] = 0.0
+    for m in range(0, pushed, 4):
+        a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
+        _add_four(shape, t, a, b, c, d, force[a], force[b], force[c], force[d], load, row)
+
+
+@njit(**KERNEL)
+def _step_modes(decay, drive, t, load, modal):  # type: ignore[no-untyped-def]
+    """y = E y + d p; modal holds -im of y, so that a real part is a plain scalar product."""
+    for k in range(modal.shape[2]):
+        x, y, p, q = modal[t, 0, k], modal[t, 1, k], load[t, 0, k], load[t, 1, k]
+        e, f, a, b = decay[t, 0, k], decay[t, 1, k], drive[t, 0, k], drive[t, 1, k]
+        modal[t, 0, k] = e * x + f * y + a * p - b * q
+        modal[t, 1, k] = e * y - f * x - a * q - b * p
+
+
+@njit(**KERNEL)
+def _decay_modes(decay, t, modal):  # type: ignore[no-untyped-def]
+    """y = E y."""
+    for k in range(modal.shape[2]):
+        x, y, e, f = modal[t, 0, k], modal[t, 1, k], decay[t, 0, k], decay[t, 1, k]
+        modal[t, 0, k] = e * x + f * y
+        modal[t, 1, k] = e * y - f * x
+
+
+@njit(**KERNEL)
+def _predict(now, recall, t, guess, load, modal, predicted):  # type: ignore[no-untyped-def]
+    """q = y + a p - (c/E) p' with p guessed; predicted holds -im of q."""
+    for k in range(modal.shape[2]):
+        p, q, r, s = guess[0, k], guess[1, k], load[t, 0, k], load[t, 1, k]
+        a, b, c, d = now[t, 0, k], now[t, 1, k], recall[t, 0, k], recall[t, 1, k]
+        predicted[0, k] = modal[t, 0, k] + a * p - b * q + c * r - d * s
+        predicted[1, k] = modal[t, 1, k] - a * q - b * p - c * s - d * r
+
+
+@njit(**KERNEL)
+def _keep(modal, t, history, row):  # type: ignore[no-untyped-def]
+    for k in range(modal.shape[1]):
+        history[row, t, k] = modal[t, k]
+
+
+@njit(**KERNEL)
+def _dot_four(weights, row, values, t, a, b, c, d):  # type: ignore[no-untyped-def]
+    zero = weights.dtype.type(0)
+    p, q, r, s = zero, zero, zero, zero
+    for k in range(weights.shape[1]):
+        p += weights[row, k] * values[t, a, k]
+        q += weights[row, k] * values[t, b, k]
+        r += weights[row, k] * values[t, c, k]
+        s += weights[row, k] * values[t, d, k]
     return p, q, r, s
 
 
 @njit(**KERNEL)
-def _dot(weights, a):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for k in range(weights.size):
-        total += weights[k] * a[k]
-    return total
+def _add_dots(shape, t, pushing, pushed, modes, displacement):  # type: ignore[no-untyped-def]
+    """displacement += what the modes of a tile move the rail at every wheelset that pushes."""
+    for m in range(0, pushed, 4):
+        a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
+        p, q, r, s = _dot_four(modes, 0, shape, t, a, b, c, d)
+        displacement[a] += p
+        displacement[b] += q
+        displacement[c] += r
+        displacement[d] += s
 
 
 @njit(**KERNEL)
-def _observe(history, weights, outputs):  # type: ignore[no-untyped-def]
-    """outputs += history @ weights.T; threads of a BLAS would cost more than they save here."""
-    samples = history.shape[0]
-    for o in range(weights.shape[0]):
-        n = 0
-        while n + 3 < samples:
-            p, q, r, s = _dot_four(
-                weights[o], history[n], history[n + 1], history[n + 2], history[n + 3]
-            )
-            outputs[n, o] += p
-            outputs[n + 1, o] += q
-            outputs[n + 2, o] += r
-            outputs[n + 3, o] += s
-            n += 4
-        while n < samples:
-            outputs[n, o] += _dot(weights[o], history[n])
-            n += 1
+def _observe(history, weights, begin, end, outputs):  # type: ignore[no-untyped-def]
+    """outputs[begin:end] += history @ weights.T; starting a BLAS would cost more than it saves.
+
+    Rows of ``history`` beyond ``end - begin`` are read but not used: that every sample goes the
+    same way keeps its bits independent of how a run is cut.
+    """
+    for n in range(0, end - begin, 4):
+        at, left = begin + n, end - begin - n
+        for o in range(weights.shape[0]):
+            p, q, r, s = _dot_four(weights, o, history, 0, n, n + 1, n + 2, n + 3)
+            outputs[at, o] += p
+            if left > 1:
+                outputs[at + 1, o] += q
+            if left > 2:
+                outputs[at + 2, o] += r
+            if left > 3:
+                outputs[at + 3, o] += s
 
 
 @njit(**KERNEL)
-def _cubic(c, s):  # type: ignore[no-untyped-def]
-    return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
+def _cubic(c, row, cell, s):  # type: ignore[no-untyped-def]
+    return c[row, cell, 0] + s * (c[row, cell, 1] + s * (c[row, cell, 2] + s * c[row, cell, 3]))
 
 
 @njit(**KERNEL)
-def _feed(c, s, force, out):  # type: ignore[no-untyped-def]
-    for o in range(out.size):
-        out[o] += force * (c[0, o] + s * (c[1, o] + s * (c[2, o] + s * c[3, o])))
+def _feed(c, row, cell, s, force, outputs, n):  # type: ignore[no-untyped-def]
+    for o in range(outputs.shape[1]):
+        outputs[n, o] += force * (
+            c[row, cell, 0, o]
+            + s * (c[row, cell, 1, o] + s * (c[row, cell, 2, o] + s * c[row, cell, 3, o]))
+        )
+
+
+@njit(**KERNEL)
+def _step_unit(transition, drive, constant, t, states, first, axles, force, n, u, state, scratch):  # type: ignore[no-untyped-def]
+    for r in range(states):
+        scratch[r] = constant[t, r]
+    for c in range(states):
+        factor = state[u, c]
+        for r in range(states):
+            scratch[r] += factor * transition[t, c, r]
+    for a in range(axles):
+        factor = force[n, first + a]
+        for r in range(states):
+            scratch[r] += factor * drive[t, a, r]
+    for r in range(states):
+        state[u, r] = scratch[r]
 
 
 @njit(**KERNEL)
@@ -453,7 +508,8 @@ def _march(  # type: ignore[no-untyped-def]
     shapes,
     decay,
     drive,
-    predict,
+    now_weight,
+    recall,
     compliance,
     channel_weights,
     channel_feed,
@@ -463,7 +519,8 @@ def _march(  # type: ignore[no-untyped-def]
     modal,
     load,
     shape,
-    spare,
+    guess,
+    predicted,
     history,
     kind,
     first,
@@ -480,103 +537,114 @@ def _march(  # type: ignore[no-untyped-def]
     last_force,
     last_place,
     touching,
-    gap,
-    own,
     scratch,
     position,
     roughness,
     force,
     outputs,
 ):
-    size = decay.shape[1]
-    width = 2 * size
-    last_cell = shapes.shape[0] - 1
+    tiles, _, size = decay.shape
+    samples, axles = position.shape
+    last_cell = shapes.shape[1] - 1
+    flat_modal, flat_load = modal.reshape(tiles, 2 * size), load.reshape(tiles, 2 * size)
+    flat_guess, flat_predicted = guess.reshape(1, 2 * size), predicted.reshape(1, 2 * size)
+    flat_history = history.reshape(1, len(history), tiles * 2 * size)
+    rows = len(history)
     lost = 0
     worst = 0.0
-    pushing = np.empty(position.shape[1], np.int64)
-    for n in range(position.shape[0]):
-        row = n % history.shape[0]
-        history[row] = modal
-        outputs[n] = 0.0
-        pushed = 0
-        for i in range(position.shape[1]):
-            x = position[n, i]
-            if 0.0 <= x <= length:
-                at = (x - grid_start) / grid_step
-                cell = min(int(at), last_cell)
-                c = shapes[cell]
-                _shape_at(
-                    c[:width],
-                    c[width : 2 * width],
-                    c[2 * width : 3 * width],
-                    c[3 * width :],
-                    shapes.dtype.type(at - cell),
-                    shape[i],
-                )
-                pushing[pushed] = i
-                pushed += 1
-        if pushed > 0:
-            guess, predicted = spare[0], spare[1]
-            _sum_loads(shape, pushing, pushed, last_force, guess)
-            _predict(
-                predict[0],
-                predict[1],
-                predict[2],
-                predict[3],
-                guess[:size],
-                guess[size:],
-                load[:size],
-                load[size:],
-                modal[:size],
-                modal[size:],
-                predicted[:size],
-                predicted[size:],
-            )
+    # the wheelsets on the line, filled up to a multiple of four with one that never pushes
+    count, pushed = 0, 0
+    here, pushing = np.full(axles + 4, axles), np.full(axles + 4, axles)
+    cell, place = np.zeros(axles + 1, np.int64), np.zeros(axles + 1)
+    push = np.zeros(axles + 1, shapes.dtype)
+    displacement, gap, own = np.zeros(axles + 1), np.empty(axles), np.empty(axles)
+    # tile by tile: the last sample's forces on the modes, then the prediction of this one
+    for n in range(samples + 1):
+        row = n % rows
+        if n < samples:
+            count = 0
+            for i in range(axles):
+                x = position[n, i]
+                if 0.0 <= x <= length:
+                    at = (x - grid_start) / grid_step
+                    cell[i] = min(int(at), last_cell)
+                    place[i] = at - cell[i]
+                    displacement[i] = 0.0
+                    here[count] = i
+                    count += 1
+            here[count : count + 3] = axles
+            for o in range(outputs.shape[1]):
+                outputs[n, o] = 0.0
+        for t in range(tiles):
+            if n > 0:
+                if pushed > 0:
+                    _sum_loads(shape, t, pushing, pushed, push, flat_load, t)
+                    _step_modes(decay, drive, t, load, modal)
+                else:
+                    _decay_modes(decay, t, modal)
+            if n < samples:
+                _keep(flat_modal, t, history, row)
+                if count > 0:
+                    for m in range(count):
+                        i = here[m]
+                        _shape_at(shapes, t, cell[i], shapes.dtype.type(place[i]), shape, i)
+                        push[i] = last_force[i]
+                    _sum_loads(shape, t, here, count, push, flat_guess, 0)
+                    _predict(now_weight, recall, t, guess, load, modal, predicted)
+                    _add_dots(shape, t, here, count, flat_predicted, displacement)
+        if n == samples:
+            break
         for u in range(kind.size):
             t = kind[u]
             begin = first[u]
-            count = first[u + 1] - begin
-            for a in range(count):
+            own_axles = first[u + 1] - begin
+            for a in range(own_axles):
                 i = begin + a
                 x, old = position[n, i], last_place[i]
                 own[i] = -now[t, a, a]
                 gap[i] = state[u, wheelsets[t, a]] - roughness[n, i]
-                for b in range(count):
+                for b in range(own_axles):
                     gap[i] += before[t, a, b] * last_force[begin + b]
                     if b < a:
                         gap[i] += now[t, a, b] * force[n, begin + b]
                     elif b > a:
                         gap[i] += now[t, a, b] * last_force[begin + b]
-                if 0.0 <= old <= length and outputs.shape[1] > 0:
+                if 0.0 <= old <= length:
                     at = (old - grid_start) / grid_step
-                    cell = min(int(at), last_cell)
-                    _feed(channel_feed[1, cell], at - cell, last_force[i], outputs[n])
+                    old_cell = min(int(at), last_cell)
+                    _feed(channel_feed, 1, old_cell, at - old_cell, last_force[i], outputs, n)
                 if not 0.0 <= x <= length:
                     force[n, i] = solve_contact(gap[i], own[i], linear[i], hertz[i])
                     continue
-                at = (x - grid_start) / grid_step
-                cell = min(int(at), last_cell)
-                s = at - cell
-                modes = _cubic(compliance[0, cell], s)
-                gap[i] += modes * last_force[i] - _dot(shape[i], spare[1])
-                own[i] += modes + _cubic(compliance[1, cell], s)
+                s = place[i]
+                modes = _cubic(compliance, 0, cell[i], s)
+                gap[i] += modes * last_force[i] - displacement[i]
+                own[i] += modes + _cubic(compliance, 1, cell[i], s)
                 f = solve_contact(gap[i], own[i], linear[i], hertz[i])
                 force[n, i] = f
-                _feed(channel_feed[0, cell], s, f, outputs[n])
-            for a in range(count):
+                _feed(channel_feed, 0, cell[i], s, f, outputs, n)
+            for a in range(own_axles):
                 i = begin + a
                 f = force[n, i]
                 closed = gap[i] - own[i] * f
-                for b in range(a + 1, count):
+                for b in range(a + 1, own_axles):
                     closed += now[t, a, b] * (force[n, begin + b] - last_force[begin + b])
                 worst = max(worst, abs(f - force_of(closed, linear[i], hertz[i])))
-            for r in range(states[t]):
-                total = constant[t, r] + _dot(transition[t, r, : states[t]], state[u, : states[t]])
-                for a in range(count):
-                    total += unit_drive[t, r, a] * force[n, begin + a]
-                scratch[r] = total
-            state[u, : states[t]] = scratch[: states[t]]
-            for a in range(count):
+            _step_unit(
+                transition,
+                unit_drive,
+                constant,
+                t,
+                states[t],
+                begin,
+                own_axles,
+                force,
+                n,
+                u,
+                state,
+                scratch,
+            )
+            for a in range(own_axles):
                 i = begin + a
                 last_force[i] = force[n, i]
                 last_place[i] = position[n, i]
@@ -586,19 +654,17 @@ def _march(  # type: ignore[no-untyped-def]
                     touching[i] = force[n, i] > 0.0
                 else:
                     force[n, i] = np.nan
-        _sum_loads(shape, pushing, pushed, last_force, load)
-        _step_modes(
-            decay[0],
-            decay[1],
-            drive[0],
-            drive[1],
-            load[:size],
-            load[size:],
-            modal[:size],
-            modal[size:],
-        )
-        if row == history.shape[0] - 1 or n == position.shape[0] - 1:
-            _observe(history[: row + 1], channel_weights, outputs[n - row : n + 1])
+        if pushed > 0 and count == 0:
+            for t in range(tiles):
+                for k in range(2 * size):
+                    flat_load[t, k] = 0.0
+        pushed = count
+        for m in range(count + 3):
+            pushing[m] = here[m]
+        for m in range(count):
+            push[here[m]] = last_force[here[m]]
+        if row == rows - 1 or n == samples - 1:
+            _observe(flat_history, channel_weights, n - row, n + 1, outputs)
     return lost, worst
 
 
@@ -613,31 +679,30 @@ def march_reference(
     outputs: Array,
 ) -> tuple[int, float]:
     """What :func:`march` does, in a form to be read; a thousand times slower."""
-    size = tables.size
-    decay = tables.decay[0] + 1j * tables.decay[1]
-    drive = tables.drive[0] + 1j * tables.drive[1]
-    now_weight = tables.predict[0] + 1j * tables.predict[1]
-    last_weight = tables.predict[2] + 1j * tables.predict[3]
-    p = load[:size] + 1j * load[size:]
+    decay, drive = tables.unpack(tables.decay), tables.unpack(tables.drive)
+    now_weight, last_weight = tables.unpack(tables.now), tables.unpack(tables.recall)
+    p = tables.unpack(load)
     lost, worst = 0, 0.0
 
     def locate(x: float) -> tuple[int, Array]:
         at = (x - tables.grid_start) / tables.grid_step
-        cell = min(int(at), len(tables.shapes) - 1)
+        cell = min(int(at), tables.shapes.shape[1] - 1)
         return cell, np.asarray((at - cell) ** np.arange(4), np.float64)
 
     def shape_at(x: float) -> Complex:
         cell, powers = locate(x)
-        coefficients = tables.shapes[cell].reshape(4, 2, size).astype(np.float64)
-        return np.asarray(powers @ coefficients[:, 0] + 1j * (powers @ coefficients[:, 1]))
+        return sum(
+            (power * tables.unpack(tables.shapes[:, cell, j]) for j, power in enumerate(powers)),
+            np.zeros_like(decay),
+        )
 
     for n in range(len(position)):
-        y = modal[:size] - 1j * modal[size:]
-        outputs[n] = tables.channel_weights @ modal
+        y = tables.unpack(modal).conj()
+        outputs[n] = tables.channel_weights @ modal.ravel()
         shapes = {i: shape_at(x) for i, x in enumerate(position[n]) if 0 <= x <= tables.length}
-        guess = sum((fleet.force[i] * shape for i, shape in shapes.items()), np.zeros(size))
+        guess = sum((fleet.force[i] * shape for i, shape in shapes.items()), np.zeros_like(y))
         q = y + now_weight * guess + last_weight * p
-        p = np.zeros(size, dtype=np.complex128)
+        p = np.zeros_like(y)
         for u, t in enumerate(fleet.kind):
             axles = slice(fleet.first[u], fleet.first[u + 1])
             count = axles.stop - axles.start
@@ -675,8 +740,8 @@ def march_reference(
                 worst = max(worst, abs(float(new[a]) - force_of(float(closed), *law)))
             states = fleet.states[t]
             fleet.state[u, :states] = (
-                fleet.transition[t, :states, :states] @ fleet.state[u, :states]
-                + fleet.drive[t, :states, :count] @ new
+                fleet.state[u, :states] @ fleet.transition[t, :states, :states]
+                + new @ fleet.drive[t, :count, :states]
                 + fleet.constant[t, :states]
             )
             lost += int((on & fleet.touching[axles] & (new <= 0)).sum())
@@ -684,8 +749,7 @@ def march_reference(
             fleet.force[axles], fleet.place[axles] = new, x
             force[n, axles] = np.where(on, new, np.nan)
         y = decay * y + drive * p
-        modal[:size], modal[size:] = y.real, -y.imag
-        load[:size], load[size:] = p.real, p.imag
+        modal[:], load[:] = tables.pack(y.conj()), tables.pack(p)
     return lost, float(worst)
 
 
@@ -729,8 +793,8 @@ class ModalRun:
         traffic: the trains.
         derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
         order: interpolation of forces in time, see :func:`modal_tables`.
-        precision: of the rail shapes; single precision changes forces and accelerations by less
-            than 1e-5 of their peaks and is a third faster.
+        precision: of the shapes and of the sums over modes; single precision changes forces and
+            accelerations by less than 1e-4 of their peaks, the modes themselves are always double.
         marching: :func:`march` or its readable twin.
     """
 
@@ -758,8 +822,8 @@ class ModalRun:
         self._residual = one_sided_cubics(line.channel_residual)
         self._next = 0
         self._held: list[Array] = []
-        self._modal: Array = np.zeros(2 * self.tables.size)
-        self._load: Array = np.zeros(2 * self.tables.size)
+        self._modal: Array = aligned(self.tables.decay.shape, np.float64)
+        self._load: NDArray[np.floating] = aligned(self.tables.decay.shape, precision)
         self._units: list[Running] = []
         self._loads: Array = np.zeros(0)
         self._fleet: Fleet | None = None
@@ -958,11 +1022,9 @@ class ModalRun:
         rest, force = static_start(whole, law, compliance, roughness)
         if on_line.any():
             load = (shapes * np.sqrt(weights)).T @ force
-            y = self.tables.start_weights[: len(load)] * load
-            self._load[: len(load)] += load.real
-            self._load[self.tables.size : self.tables.size + len(load)] += load.imag
-            self._modal[: len(load)] += y.real
-            self._modal[self.tables.size : self.tables.size + len(load)] -= y.imag
+            y = self.tables.start_weights * load
+            self._load += self.tables.pack(load)
+            self._modal += self.tables.pack(y.conj())
         states, forces, first, axle = [], [], 0, 0
         for unit in units:
             size, axles = len(unit.unit.weight), len(unit.unit.wheelsets)

@@ -36,15 +36,16 @@ BLOCK = 800
 BAND = 2000.0
 """Errors of force and acceleration are taken below this frequency (Hz)."""
 
-# Work of the stepping kernel per step, counted in its loops (solver/modal.py), in words of 8 bytes.
-# Wheelset on the line and mode: 8 single-precision coefficients read, 2 written, the 2 read three
-# times, twice with a quarter of 4 load words, once with 2 state words.
-WORDS_PER_WHEELSET_AND_MODE = 12
+# Work of the stepping kernel per step, counted in its loops (solver/modal.py), in words of 8 bytes;
+# all but the modes themselves and their factors is in single precision.
+# Wheelset on the line and mode: 8 coefficients read, the shape's 2 parts written and read three
+# times, twice with a quarter of 4 load values, once with a quarter of 2 predicted ones.
+WORDS_PER_WHEELSET_AND_MODE = 9.25
 FLOPS_PER_WHEELSET_AND_MODE = 24
-# Mode: copy 4, clear 4, prediction 12, update 10; channel outputs 2.5 each.
-WORDS_PER_MODE = 30
+# Mode: clear 2, step 9, copy 3, prediction 9; channel outputs 1.25 each.
+WORDS_PER_MODE = 23
 FLOPS_PER_MODE = 32
-WORDS_PER_CHANNEL_AND_MODE = 2.5
+WORDS_PER_CHANNEL_AND_MODE = 1.25
 FLOPS_PER_CHANNEL_AND_MODE = 4
 
 
