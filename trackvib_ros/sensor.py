@@ -12,9 +12,10 @@ import zlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.signal import butter, firwin, kaiser_beta, kaiserord, sosfilt, upfirdn
+from scipy.signal import butter, firwin, kaiser_beta, kaiserord
 
 from solver import GRAVITY, InputError, Scenario, Sensor
 from trackvib_ros.waveform import Waveform
@@ -124,12 +125,20 @@ class VirtualSensor:
                 "limit of the jitter model"
             )
         orders = (0, 1, 2) if spec.timing_jitter > 0 else (0,)
-        self._filters = [_derivative(taps, solver_rate, n) if n else taps for n in orders]
+        every = [_derivative(taps, solver_rate, n) if n else taps for n in orders]
+        # first tap last: a scalar product with samples in order is then the convolution
+        self._filters = np.ascontiguousarray(np.array(every)[:, ::-1])
         half = taps.size // 2
         self.latency = half / solver_rate
         self._pending = np.zeros(half)
-        self._high_pass = butter(1, spec.high_pass, "highpass", fs=spec.rate, output="sos")
-        self._memory = np.zeros((1, 2))
+        self._high_pass = np.array([1.0, 0.0, 0.0])
+        if spec.coupling == "AC":
+            (b0, b1), (_, a1) = butter(1, spec.high_pass, "highpass", fs=spec.rate)
+            self._high_pass[:] = b0, b1, a1
+        self._memory = np.zeros(1)
+        self._offset = spec.bias + (0.0 if spec.coupling == "AC" else GRAVITY)
+        self._deviation = spec.noise_density * math.sqrt(spec.rate / 2)
+        self._half_codes = 2.0 ** (spec.bits - 1)
         streams = [
             np.random.default_rng([spec.seed, zlib.crc32(spec.channel.encode()), purpose])
             for purpose in range(3)
@@ -142,46 +151,82 @@ class VirtualSensor:
 
         Drop-outs are NaN.
         """
-        signal = self._decimate(acceleration)
-        if signal.size == 0:
-            return np.empty(0, np.float32)
-        if self.spec.coupling == "AC":
-            signal, self._memory = sosfilt(self._high_pass, signal, zi=self._memory)
-        else:
-            signal = signal + GRAVITY
-        deviation = self.spec.noise_density * np.sqrt(self.spec.rate / 2)
-        signal = signal + self.spec.bias + deviation * self._noise.standard_normal(signal.size)
-        return self._convert(signal)
-
-    def _decimate(self, acceleration: NDArray[np.float64]) -> NDArray[np.float64]:
-        length, step = self._filters[0].size, self._decimation
-        self._pending = np.concatenate((self._pending, UP * acceleration))
+        length, step = self._filters.shape[1], self._decimation
+        self._pending = np.concatenate((self._pending, acceleration))
         count = max(0, (self._pending.size - length) // step + 1)
+        output = np.empty(count, np.float32)
         if count == 0:
-            return np.empty(0)
-        used = self._pending[: length + (count - 1) * step]
-        first = (length - 1) // step
-        # upfirdn adds the products in the order of the taps, so a block's length cannot matter
-        parts = [upfirdn(taps, used, 1, step)[first : first + count] for taps in self._filters]
+            return output
+        shift = np.zeros(0)
+        if len(self._filters) > 1:
+            shift = self.spec.timing_jitter * self._jitter.standard_normal(count)
+        self.clipped += _sample(
+            self._pending,
+            self._filters,
+            step,
+            shift,
+            self._high_pass,
+            self._memory,
+            self._offset,
+            self._deviation,
+            self._noise.standard_normal(count),
+            self.spec.range / self._half_codes,
+            self._half_codes,
+            output,
+        )
         self._pending = self._pending[count * step :]
-        if len(parts) == 1:
-            return parts[0]
-        shift = self.spec.timing_jitter * self._jitter.standard_normal(count)
-        signal, slope, curvature = parts
-        return np.asarray(signal + shift * slope + 0.5 * shift**2 * curvature)
-
-    def _convert(self, signal: NDArray[np.float64]) -> NDArray[np.float32]:
-        half_codes = 2.0 ** (self.spec.bits - 1)
-        resolution = self.spec.range / half_codes
-        code = np.round(signal / resolution)
-        self.clipped += int(np.count_nonzero((code <= -half_codes) | (code >= half_codes - 1)))
-        output = (np.clip(code, -half_codes, half_codes - 1) * resolution).astype(np.float32)
-        time = (self.samples + np.arange(signal.size)) / self.spec.rate
-        lost = self._dropouts.mask(time)
-        output[lost] = np.nan
-        self.samples += signal.size
-        self.dropped += int(np.count_nonzero(lost))
+        if self.spec.dropout_rate > 0:
+            lost = self._dropouts.mask((self.samples + np.arange(count)) / self.spec.rate)
+            output[lost] = np.nan
+            self.dropped += int(np.count_nonzero(lost))
+        self.samples += count
         return output
+
+
+@njit(cache=True, fastmath={"contract", "reassoc"})
+def _tap(pending, begin, filters, order):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(filters.shape[1]):
+        total += filters[order, k] * pending[begin + k]
+    return total
+
+
+@njit(cache=True)
+def _sample(  # type: ignore[no-untyped-def]
+    pending,
+    filters,
+    step,
+    shift,
+    high_pass,
+    memory,
+    offset,
+    deviation,
+    noise,
+    resolution,
+    half_codes,
+    output,
+):
+    """Fill ``output``; the taps of a sample are summed in one order, however blocks are cut.
+
+    Returns the number of samples at the end of the range.
+    """
+    b0, b1, a1 = high_pass[0], high_pass[1], high_pass[2]
+    kept, clipped = memory[0], 0
+    for n in range(output.size):
+        value = _tap(pending, n * step, filters, 0)
+        if filters.shape[0] > 1:
+            slope = _tap(pending, n * step, filters, 1)
+            curvature = _tap(pending, n * step, filters, 2)
+            value += shift[n] * slope + 0.5 * shift[n] ** 2 * curvature
+        value *= UP
+        passed = b0 * value + kept
+        kept = b1 * value - a1 * passed
+        code = np.rint((passed + offset + deviation * noise[n]) / resolution)
+        if code <= -half_codes or code >= half_codes - 1:
+            clipped += 1
+        output[n] = min(max(code, -half_codes), half_codes - 1) * resolution
+    memory[0] = kept
+    return clipped
 
 
 class SensorGroup:
