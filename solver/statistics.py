@@ -13,10 +13,14 @@ Forms of A for modes known only statistically:
 
 - ``paper``: three sharp classes (Eqs. 9-10): a negative effective mass below the resonant band,
   -i pi n <a a^T>/(2 omega) inside, nothing above.
-- ``repaired``: every natural frequency is spread evenly over +/- ``spread``; the mean is closed.
-  Far from omega it is the exact term on either side, near it the damping of Eq. (10). The local
-  field's return onto the global set follows from diffuse-field reciprocity (Shorter and Langley,
-  JSV 288, 2005), S_ff = 4 E/(pi omega n) Im D_dir, with its dissipation in the balance.
+- ``repaired``: every natural frequency is spread evenly over +/- ``half_width``. Each mode sees the
+  others as the mean medium that they make together, and the medium is such that a mode put in its
+  place scatters nothing in the mean (coherent potential approximation: Soven, Phys. Rev. 156
+  (1967) 809). Far from omega that is the exact term on either side, near it the damping of
+  Eq. (10), lessened by what the mode gives to the rest. What scatters in the square is the
+  reverberant field: a power balance between single modes (the ladder of multiple scattering),
+  which at high modal overlap is the diffuse-field reciprocity of Shorter and Langley (JSV 288,
+  2005), S_ff = 4 E/(pi omega n) Im D_dir.
 """
 
 from __future__ import annotations
@@ -39,6 +43,9 @@ RESONANT_BAND = 2 ** (1 / 6)
 
 SPREAD = 2 ** (1 / 12) - 1
 """Repaired form: least relative half width over which a natural frequency is spread."""
+
+MEDIUM_TOLERANCE = 1e-9
+MEDIUM_STEPS = 500
 
 
 def condense(
@@ -121,12 +128,6 @@ def exact_sum(a: Real, omega_k: Real, loss: float, omega: float) -> Complex:
     return np.asarray((a.T * terms) @ a)
 
 
-def density_matrix(a: Real, omega_k: Real, omega: float, half_width: float) -> Real:
-    """n <a a^T> (1/(rad/s)): mean over the modes within +/- half_width (rad/s) of omega."""
-    near = np.abs(omega_k - omega) <= half_width
-    return np.asarray(a[near].T @ a[near] / (2 * half_width))
-
-
 def paper_sum(a: Real, omega_k: Real, omega: float) -> Complex:
     """A by the paper's three sharp classes; the resonant mean over a third octave."""
     low = omega / RESONANT_BAND
@@ -145,17 +146,77 @@ def spacings(omega_k: Real) -> Real:
     return np.asarray(np.abs(np.gradient(omega_k)))
 
 
-def spread_terms(omega_k: Real, loss: float, omega: float, half_width: Real) -> Complex:
-    """Mean of 1/(omega_k^2 (1 + i eta) - omega^2) over omega_k +/- half_width (rad/s), (L,).
+def spread_mean(omega_k: Real, squared: Complex, half_width: Real) -> Complex:
+    """Mean of 1/(w^2 - z^2) over w = omega_k +/- half_width (rad/s), z^2 ``squared``: (L,).
 
-    With z^2 = omega^2/(1 + i eta) the mean of 1/(w^2 - z^2) over an interval is
-    ln((w - z)/(w + z))/(2 z) between its ends, divided by its length.
+    It is ln((w - z)/(w + z))/(2 z) between the interval's ends, divided by its length.
     """
-    z = omega / np.sqrt(1 + 1j * loss)
+    z = np.sqrt(squared)
+    z = np.where(z.imag > 0, -z, z)
     high, low = omega_k + half_width, omega_k - half_width
     # the branch is continuous: w - z stays in the upper half plane, because Im z < 0
     rise = np.log((high - z) / (high + z)) - np.log((low - z) / (low + z))
-    return np.asarray(rise / (2 * z * (high - low)) / (1 + 1j * loss))
+    return np.asarray(rise / (2 * z * (high - low)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Medium:
+    """What uncertain modes are in the mean, and how one of them departs from it.
+
+    Attributes:
+        terms: (L,) sigma, in place of 1/(omega_k^2 (1 + i eta) - omega^2).
+        inverse: (G, G) of the global set's dynamic stiffness with them.
+        own: (L,) 1 - sigma c, c what a mode feels of itself by way of all others.
+        scattered: (L,) mean |T|^2 of the scattering T of a mode, whose mean is zero.
+        stored: (L,) mean omega_k^2 |p|^2/2 per square of the field that acts on the mode.
+    """
+
+    terms: Complex
+    inverse: Complex
+    own: Complex
+    scattered: Real
+    stored: Real
+
+
+def _medium(own: Complex, a: Real, omega_k: Real, loss: float, omega: float, half: Real) -> _Medium:
+    """Solve <T> = 0 by fixed-point steps.
+
+    A mode answers a field with 1/(d - c), d = omega_k^2 (1 + i eta) - omega^2; with its mean m the
+    term is sigma = m/(1 + m c), and T = (1 - sigma c)((1 - sigma c)/(d - c) - sigma).
+
+    Raises:
+        SolverError: the steps do not settle.
+    """
+    complex_loss = 1 + 1j * loss
+    terms = spread_mean(omega_k, np.full(len(omega_k), omega**2 / complex_loss), half)
+    terms = terms / complex_loss
+    for _ in range(MEDIUM_STEPS):
+        inverse = np.linalg.inv(own - (a.T * terms) @ a)
+        echo = np.einsum("kg,gh,kh->k", a, inverse, a)
+        fed = echo / (1 + terms * echo)
+        squared = (omega**2 + fed) / complex_loss
+        mean = spread_mean(omega_k, squared, half)
+        new = (mean / complex_loss) / (1 + mean / complex_loss * fed)
+        change = float(np.abs(new - terms).max() / np.abs(new).max())
+        terms = new
+        if change < MEDIUM_TOLERANCE:
+            break
+    else:
+        raise SolverError(
+            f"mean terms of the local modes at omega = {omega:.6g} rad/s still change by "
+            f"{change:.3g} after {MEDIUM_STEPS} steps; limit {MEDIUM_TOLERANCE:g}"
+        )
+    away = 1 - terms * fed
+    answer = np.abs(mean / complex_loss) ** 2
+    square = mean.imag / squared.imag / abs(complex_loss) ** 2
+    weighted = (squared * mean).imag / squared.imag / abs(complex_loss) ** 2
+    return _Medium(
+        terms,
+        np.asarray(inverse),
+        away,
+        np.abs(away) ** 4 * np.maximum(square - answer, 0.0),
+        0.5 * np.abs(away) ** 2 * weighted,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,11 +271,19 @@ def respond_statistically(
     loss: float,
     omega: float,
     form: Form = "repaired",
+    half_width: Real | None = None,
 ) -> Response:
     """Mean response over the ensemble of local modes by the form asked for.
 
+    Args:
+        part, rows_g, rows_p, loss, omega: see :func:`respond`.
+        form: see the module.
+        half_width: (L,) rad/s, how far natural frequencies may lie off; by default one mean
+            spacing or 1/12 octave, whichever is more. Only for ``repaired``.
+
     Raises:
         InputError: omega lies below the first local mode, where a power balance means nothing.
+        SolverError: the mean medium is not found.
     """
     if omega < part.omega[0]:
         raise InputError(
@@ -223,35 +292,30 @@ def respond_statistically(
         )
     a = vectors(part.coupling, rows_p.T, omega)
     g = part.mass.shape[0]
-    spacing = spacings(part.omega)
+    own = np.asarray(part.stiffness * (1 + 1j * loss) - omega**2 * part.mass, np.complex128)
     if form == "paper":
         held = paper_sum(a, part.omega, omega)
-    else:
-        width = np.maximum(SPREAD * part.omega, spacing)
-        terms = spread_terms(part.omega, loss, omega, width)
-        held = (a.T * terms) @ a
-    own = part.stiffness * (1 + 1j * loss) - omega**2 * part.mass
-    inverse = np.linalg.inv(own - held[:g, :g])
-    q = inverse @ (rows_g.T + held[:g, g:])
-    direct = np.diag(rows_g @ q + held[g:, :g] @ q + held[g:, g:])
-    motion = np.vstack((q, np.eye(len(rows_g))))
-    absorbing = -held.imag
-    power_in = 0.5 * omega * np.einsum("ip,ij,jp->p", motion.conj(), absorbing, motion).real
-    if form == "paper":
+        q = np.linalg.solve(own - held[:g, :g], rows_g.T + held[:g, g:])
+        direct = np.diag(rows_g @ q + held[g:, :g] @ q + held[g:, g:])
+        motion = np.vstack((q, np.eye(len(rows_g))))
+        power_in = 0.5 * omega * np.einsum("ip,ij,jp->p", motion.conj(), -held.imag, motion).real
         energy = power_in / (omega * loss)
         return Response(np.abs(direct) ** 2, -0.5 * omega * direct.imag, energy)
-    density = 1 / float(np.interp(omega, part.omega, spacing))
-    unit = 4 / (np.pi * omega * density) * absorbing  # force spectrum per energy
-    returned = inverse @ unit[:g, :g] @ inverse.conj().T
-    back = 0.5 * omega * float(np.trace(own.imag @ returned).real)
-    # the coherent field is what the terms' mean already answers; only the rest comes back
-    coherent = 0.5 * (part.omega**2 * np.abs(terms) ** 2) @ np.abs(a @ motion) ** 2
-    energy = (power_in + back * coherent) / (omega * loss + back)
-    incoherent = np.maximum(energy - coherent, 0.0)
-    heard = np.hstack(((rows_g + held[g:, :g]) @ inverse, np.eye(len(rows_g))))
-    reverberant = np.einsum("pi,ij,pj->p", heard, unit, heard.conj()).real
+    if half_width is None:
+        half_width = np.maximum(SPREAD * part.omega, spacings(part.omega))
+    medium = _medium(own, a[:, :g], part.omega, loss, omega, half_width)
+    held = (a.T * medium.terms) @ a
+    q = medium.inverse @ (rows_g.T + held[:g, g:])
+    direct = np.diag(rows_g @ q + held[g:, :g] @ q + held[g:, g:])
+    field = np.abs(a[:, :g] @ q + a[:, g:]) ** 2
+    between = np.abs(a[:, :g] @ medium.inverse @ a[:, :g].T) ** 2
+    np.fill_diagonal(between, 0.0)
+    # every mode hears the mean field and what all others scatter
+    heard = np.linalg.solve(np.eye(len(field)) - between * medium.scattered, field)
+    # by reciprocity a place hears a mode as the mode hears a force there
+    reverberant = (field * medium.scattered[:, None] * heard).sum(axis=0)
     return Response(
-        np.abs(direct) ** 2 + incoherent * reverberant, -0.5 * omega * direct.imag, energy
+        np.abs(direct) ** 2 + reverberant, -0.5 * omega * direct.imag, medium.stored @ heard
     )
 
 

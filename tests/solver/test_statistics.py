@@ -18,7 +18,8 @@ from solver.statistics import (
     paper_sum,
     respond,
     respond_statistically,
-    spread_terms,
+    spacings,
+    spread_mean,
     vectors,
     wavelength_classes,
 )
@@ -75,17 +76,71 @@ def test_power_closes_with_what_is_lost(rail: FreeRail) -> None:
     np.testing.assert_allclose(exact.power, lost + omega * LOSS * exact.energy, rtol=1e-9)
 
 
-def test_spread_term_is_exact_far_away_and_resonant_damping_near() -> None:
+def test_spread_mean_is_exact_far_away_and_resonant_damping_near() -> None:
     """Limits of the closed mean: 1/(w_k^2 - w^2) and -i pi n/(2 w) with n = 1/(2 half width)."""
     omega = 6000.0
-    far = spread_terms(np.array([2500.0, 15000.0]), 1e-6, omega, np.array([5.0, 5.0]))
-    np.testing.assert_allclose(far, 1 / (np.array([2500.0, 15000.0]) ** 2 - omega**2), rtol=1e-5)
-    near = spread_terms(np.array([omega]), 1e-6, omega, np.array([300.0]))
+
+    def mean(natural: list[float], loss: float, half: float) -> np.ndarray:
+        squared = np.full(len(natural), omega**2 / (1 + 1j * loss))
+        return spread_mean(np.array(natural), squared, np.full(len(natural), half))
+
+    far = np.array([2500.0, 15000.0])
+    np.testing.assert_allclose(mean(far.tolist(), 1e-6, 5.0), 1 / (far**2 - omega**2), rtol=1e-5)
+    near = mean([omega], 1e-6, 300.0)
     # the real part is the asymmetry of the interval, half width/omega
     assert near[0].imag == pytest.approx(-np.pi / (2 * omega * 600.0), rel=2e-3)
-    sampled = np.mean(1 / (np.linspace(5700, 6300, 200001) ** 2 * (1 + 0.05j) - omega**2))
-    mean = spread_terms(np.array([omega]), 0.05, omega, np.array([300.0]))
-    assert mean[0] == pytest.approx(sampled, rel=1e-4)
+    sampled = np.mean(1 / (np.linspace(5700, 6300, 200001) ** 2 - omega**2 / (1 + 0.05j)))
+    assert mean([omega], 0.05, 300.0)[0] == pytest.approx(sampled, rel=1e-4)
+
+
+def test_one_uncertain_mode_is_the_exact_mean(rail: FreeRail) -> None:
+    """All others fixed, the form is no approximation: against 20 001 places of that mode."""
+    part, rows_g, rows_p = rail.split()
+    chosen = 12
+    omega = 1.003 * part.omega[chosen]
+    half = np.full(len(part.omega), 1e-6 * omega)
+    half[chosen] = 0.05 * omega
+    formula = respond_statistically(part, rows_g, rows_p, LOSS, omega, half_width=half)
+    total = np.zeros((3, 2))
+    places = np.linspace(-1, 1, 4001)[1::2]
+    for place in places:
+        natural = part.omega.copy()
+        natural[chosen] += place * half[chosen]
+        one = respond(part, rows_g, rows_p, LOSS, omega, natural)
+        total += np.array([one.square, one.power, one.energy]) / len(places)
+    mine = np.array([formula.square, formula.power, formula.energy])
+    np.testing.assert_allclose(mine, total, rtol=2e-4)
+
+
+def test_many_modes_return_what_diffuse_field_reciprocity_says(rail: FreeRail) -> None:
+    """S_ff = 4 E/(pi omega n) Im D_dir (Shorter and Langley 2005) at overlaps above 1: 0.12 dB.
+
+    E without the part that the mean field holds, D_dir of modes blurred over a quarter octave.
+    """
+    part, rows_g, rows_p = rail.split()
+    g, loss = part.mass.shape[0], 0.1
+    for frequency in (3150.0, 4000.0, 4500.0):
+        omega = 2 * np.pi * frequency
+        a = vectors(part.coupling, rows_p.T, omega)
+        spacing = float(np.interp(omega, part.omega, spacings(part.omega)))
+        assert loss * omega / spacing > 1
+        squared = np.full(len(part.omega), omega**2 / (1 + 1j * loss))
+        blurred = np.maximum(0.09 * part.omega, spacings(part.omega))
+        terms = spread_mean(part.omega, squared, blurred) / (1 + 1j * loss)
+        held = (a.T * terms) @ a
+        own = part.stiffness * (1 + 1j * loss) - omega**2 * part.mass
+        inverse = np.linalg.inv(own - held[:g, :g])
+        motion = inverse @ (rows_g.T + held[:g, g:])
+        field = np.abs(a @ np.vstack((motion, np.eye(len(rows_g))))) ** 2
+        response = respond_statistically(part, rows_g, rows_p, loss, omega)
+        coherent = 0.5 * (part.omega**2 * np.abs(terms) ** 2) @ field
+        heard = np.hstack(((rows_g + held[g:, :g]) @ inverse, np.eye(len(rows_g))))
+        back = np.einsum("pi,ij,pj->p", heard, -held.imag, heard.conj()).real
+        back *= 4 * spacing / (np.pi * omega) * (response.energy - coherent)
+        direct = np.abs(np.diag(rows_g @ motion + held[g:, :g] @ motion + held[g:, g:])) ** 2
+        # at the end only the global set is driven; the return is worth 0.23 to 0.29 dB there
+        assert 10 * np.log10(1 + back / direct)[0] > 0.2
+        assert 10 * np.log10((direct + back) / response.square)[0] == pytest.approx(0, abs=0.12)
 
 
 def test_paper_classes_are_effective_mass_and_damping(rail: FreeRail) -> None:
@@ -120,25 +175,18 @@ def test_below_the_first_local_mode_the_balance_is_refused(rail: FreeRail) -> No
         respond_statistically(part, rows_g, rows_p, LOSS, 2 * np.pi * 300.0)
 
 
-@pytest.mark.parametrize("loss", [0.01, 0.03, 0.1, 0.3])
-def test_repaired_form_against_the_ensemble(loss: float) -> None:
-    """400 samples; end-driven (index 0) and driven inside the span (index 1)."""
-    for band in ensemble_study(loss, samples=400):
-        error = np.abs(band.error["repaired"])
-        square, flow = error[0], error[1:]
-        noise = 3 * band.scatter / np.sqrt(400 * 5)
-        if band.overlap > 0.45:
-            limits = 0.6, 0.6
-        elif band.overlap > 0.15:
-            limits = 1.3, 1.8
-        else:
-            limits = 2.0, 2.6
-        # inside the span the local modes' phi_k^2 differ between neighbours, which a mean over
-        # few modes misses: below an overlap of 0.45 power and energy reach 0.9 dB there
-        flow_limit = np.array([0.35, 0.35 if band.overlap > 0.45 else 0.9])
+@pytest.mark.parametrize(("loss", "samples"), [(0.01, 3000), (0.03, 1000), (0.1, 400), (0.3, 400)])
+def test_repaired_form_against_the_ensemble(loss: float, samples: int) -> None:
+    """End-driven (index 0) and driven inside the span (index 1): 0.35 dB and 0.6 dB.
+
+    The five frequencies of a band are hardly independent at low overlap: noise counts them as one.
+    """
+    for band in ensemble_study(loss, samples=samples):
+        square, *flow = np.abs(band.error["repaired"])
+        noise = 3 * band.scatter / np.sqrt(samples)
         where = f"{band.frequency} Hz, overlap {band.overlap:.2f}"
-        assert np.all(square < np.array(limits) + noise[0]), where
-        assert np.all(flow < flow_limit + noise[1:]), where
+        assert np.all(square < 0.6 + noise[0]), where
+        assert np.all(np.array(flow) < 0.35 + noise[1:]), where
 
 
 def test_paper_form_errs_more_and_low(rail: FreeRail) -> None:
@@ -151,15 +199,14 @@ def test_paper_form_errs_more_and_low(rail: FreeRail) -> None:
     assert np.mean([b.error["paper"][0] for b in bands]) < -2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.03, 0.1])
 def test_repaired_form_against_physical_disorder(loss: float) -> None:
-    """Random attached masses, 400 samples: energy within 1.3 dB, |w|^2 within 2 dB.
+    """Random attached masses, told as a spread of natural frequencies: 1.3 dB, |w|^2 2 dB.
 
-    From 1.6 kHz: lower modes move by less than one spacing, so that they are not random.
+    They also mix the modes, which the form does not know: not for an overlap below 0.15.
     """
-    bands = [1600.0, 2000, 2500, 3150, 4000, 5000]
-    for band in ensemble_study(loss, samples=400, disorder="masses", bands=bands):
+    for band in ensemble_study(loss, samples=400, disorder="masses"):
         error = np.abs(band.error["repaired"])
-        assert np.all(error[2] < 1.3), band.frequency
-        assert np.all(error[0] < 2.0), band.frequency
+        noise = 3 * band.scatter / np.sqrt(400)
+        assert np.all(error[2] < 1.3 + noise[2]), band.frequency
+        assert np.all(error[0] < 2.0 + noise[0]), band.frequency
