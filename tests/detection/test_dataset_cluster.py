@@ -9,9 +9,16 @@ import time
 import pytest
 
 from solver import InputError, load_scenario_text, preset_text
-from trackvib_ros.dataset import Spec, make_dataset
+from trackvib_ros.dataset import make_dataset
+from trackvib_ros.dataset_spec import Spec
 
-SPEC = Spec(scenarios=("short.toml",), trains=("metro",), snr_db=(20.0,), repeats=6, seed=3)
+TABLE = {
+    "scenarios": ["short.toml"],
+    "trains": ["metro"],
+    "snr_db": [20],
+    "repeats": 6,
+    "seed": 3,
+}
 
 
 def wait_for(condition, what, seconds=60.0):
@@ -33,12 +40,12 @@ def test_address_needs_a_port(tmp_path):
     importlib.util.find_spec("distributed") is None,
     reason="needs Dask: pip install '.[cluster]'",
 )
-def test_a_killed_worker_loses_and_doubles_nothing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_killed_worker_loses_and_doubles_nothing(tmp_path):
     demo = load_scenario_text(preset_text("demo"), "demo")
     solution = demo.solution.model_copy(update={"frequency_limit": 600.0})
     short = demo.model_copy(update={"solution": solution})
     (tmp_path / "short.toml").write_text(short.to_toml(), "utf-8")
+    spec = Spec.from_table(TABLE, "set.toml", tmp_path)
     elsewhere = tmp_path / "elsewhere"  # the workers' folder is not the client's
     elsewhere.mkdir()
     file = tmp_path / "scheduler.json"
@@ -64,19 +71,19 @@ def test_a_killed_worker_loses_and_doubles_nothing(tmp_path, monkeypatch):
             if len(told) == 2:
                 processes[1].kill()
 
-        outcome = make_dataset(SPEC, tmp_path / "set", scheduler=address, progress=step)
+        outcome = make_dataset(spec, tmp_path / "set", scheduler=address, progress=step)
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    names = sorted(case.name for case in SPEC.expand())
+    names = sorted(case.name for case in spec.expand())
     assert sorted(outcome) == names and len(told) == len(names)
     assert set(outcome.values()) <= {"made", "there"}
     found = sorted(path.name for path in (tmp_path / "set").iterdir())
     assert found == [*names, "dataset.json"]
 
     # the same bytes as without a cluster: no bag is torn, and where it was made does not matter
-    make_dataset(SPEC, tmp_path / "local", workers=1)
+    make_dataset(spec, tmp_path / "local", workers=1)
     for name in names:
         for path in (tmp_path / "local" / name).iterdir():
             assert (tmp_path / "set" / name / path.name).read_bytes() == path.read_bytes()
