@@ -78,11 +78,14 @@ class View:
         layers: channels on these layers; empty means all.
         channels: how many of them, in order of their position; 0 means all.
         known: what it knows of the train: nothing, its family or its type.
+        joined_s: blocks are joined up to this length (s): cheaper, but then the stream times at
+            which something is told are as coarse; 0 leaves them as recorded.
     """
 
     layers: tuple[str, ...] = ()
     channels: int = 0
     known: Literal["nothing", "family", "type"] = "nothing"
+    joined_s: float = 0.0
 
     def chosen(self, channels: Sequence[Channel]) -> list[Channel]:
         """The channels of a bag that are given."""
@@ -94,11 +97,11 @@ class View:
 VIEWS: dict[str, View] = {
     "all": View(),
     "rails": View(("rail",)),
-    "one rail": View(("rail",), 1),
-    "one rail, family known": View(("rail",), 1, "family"),
-    "one rail, type known": View(("rail",), 1, "type"),
-    "slab, type known": View(("slab",), 1, "type"),
-    "bridge, type known": View(("bridge",), 1, "type"),
+    "one rail": View(("rail",), 1, "nothing", 0.5),
+    "one rail, family known": View(("rail",), 1, "family", 0.5),
+    "one rail, type known": View(("rail",), 1, "type", 0.5),
+    "slab, type known": View(("slab",), 1, "type", 0.5),
+    "bridge, type known": View(("bridge",), 1, "type", 0.5),
 }
 """By name: what of a bag a detector can be given."""
 
@@ -216,7 +219,30 @@ class Recording:
             elif columns:
                 kept = tuple(block.channels[i] for i in columns)
                 blocks.append(replace(block, channels=kept, data=block.data[:, columns]))
-        return channels, blocks
+        return channels, joined(blocks, view.joined_s)
+
+
+def joined(blocks: Sequence[Waveform], length_s: float) -> list[Waveform]:
+    """Blocks of a group that follow each other without a gap, joined up to a length (s)."""
+    parts: list[list[Waveform]] = []
+    last: dict[tuple[str, ...], list[Waveform]] = {}
+    for block in blocks:
+        open_part = last.get(block.channels)
+        if (
+            open_part
+            and open_part[-1].end_ns == block.stamp_ns
+            and open_part[-1].dt_ns == block.dt_ns
+            and (block.end_ns - open_part[0].stamp_ns) * 1e-9 <= length_s
+        ):
+            open_part.append(block)
+        else:
+            last[block.channels] = [block]
+            parts.append(last[block.channels])
+    out = [
+        part[0] if len(part) == 1 else replace(part[0], data=np.concatenate([b.data for b in part]))
+        for part in parts
+    ]
+    return sorted(out, key=lambda block: block.end_ns)
 
 
 def load_factory(name: str | None) -> Factory:

@@ -186,17 +186,27 @@ def json_schema() -> dict[str, Any]:
     return TypeAdapter(ScoreFile).json_schema()
 
 
-def from_json(path: Path) -> Evaluation:
-    """The evaluation in a file of :func:`to_json`.
+def from_json(paths: Sequence[Path]) -> Evaluation:
+    """The evaluation in files of :func:`to_json`, of different bags or views.
 
     Raises:
-        InputError: the file cannot be read or is none.
+        InputError: a file cannot be read or is none, or they are of different detectors.
     """
-    try:
-        content = TypeAdapter(ScoreFile).validate_json(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, ValueError) as failure:
-        raise InputError(f"scores {path}: cannot be read: {failure}") from None
-    return Evaluation(content.detector, content.bags)
+    parts = []
+    for path in paths:
+        try:
+            parts.append(TypeAdapter(ScoreFile).validate_json(path.read_text("utf-8")))
+        except (OSError, UnicodeDecodeError, ValueError) as failure:
+            raise InputError(f"scores {path}: cannot be read: {failure}") from None
+    detectors = sorted({part.detector for part in parts})
+    if len(detectors) != 1:
+        raise InputError(f"scores of one detector belong together, not of {', '.join(detectors)}")
+    bags = [bag for part in parts for bag in part.bags]
+    names = [(bag.bag, bag.view) for bag in bags]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"bag {twice[0]}, view {twice[1]!r}, is in these files twice")
+    return Evaluation(detectors[0], bags)
 
 
 def tables(result: Evaluation, by: Sequence[str] = ()) -> list[Table]:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from trackvib_ros.evaluate import (
     check_views,
     evaluate,
     find_bags,
+    joined,
     load_factory,
     match_events,
     pairing,
@@ -122,9 +124,11 @@ def test_errors_are_found_minus_true(tmp_path):
     text = to_json(result)
     assert json.loads(text)["summary"]["rails"]["detected"] == 1.0
     (tmp_path / "scores.json").write_text(text)
-    assert from_json(tmp_path / "scores.json") == result
+    assert from_json([tmp_path / "scores.json"]) == result
     with pytest.raises(InputError, match="cannot be read"):
-        from_json(tmp_path / "none.json")
+        from_json([tmp_path / "none.json"])
+    with pytest.raises(InputError, match="twice"):
+        from_json([tmp_path / "scores.json"] * 2)
     assert set(json_schema()["properties"]) == set(json.loads(text))
     assert len(tables(result)) == 2
 
@@ -184,6 +188,16 @@ def test_a_view_gives_channels_and_knowledge():
     assert {t.name for t in catalogue_for(recording(crh3), "family")} == family
     with pytest.raises(InputError, match="not in the catalogue"):
         catalogue_for(recording([truth()]), "type")
+
+
+def test_joined_blocks_hold_the_same_samples():
+    block = recording().blocks[0]
+    later = [replace(block, stamp_ns=t * 10**6) for t in (0, 2, 4, 9)]  # 2 ms each, then a gap
+    assert joined(later, 0.0) == later
+    first, second = joined(later, 0.5)
+    np.testing.assert_array_equal(first.data, np.concatenate([b.data for b in later[:3]]))
+    assert first.end_ns == 6 * 10**6 and second.stamp_ns == 9 * 10**6
+    assert [len(b.data) for b in joined(later, 0.004)] == [4, 2, 2]
 
 
 def test_a_view_must_suit_the_detector():

@@ -66,7 +66,8 @@ def evaluate(
     ] = 0.0,
     nuisance_seed: Annotated[int, typer.Option(help="Seed of the disturbances.")] = 1,
     scores: Annotated[
-        Path | None, typer.Option(help="Take the scores of a --json file, run no detector.")
+        list[Path] | None,
+        typer.Option(help="Take the scores of a --json file, run no detector; repeatable."),
     ] = None,
     schema: Annotated[bool, typer.Option(help="Print the JSON schema of --json.")] = False,
     workers: Annotated[int, typer.Option(help="Processes; 0 is one per core.")] = 0,
@@ -89,9 +90,9 @@ def evaluate(
     if not 0 <= nuisance_hours <= 1000:
         raise InputError(f"--nuisance-hours {nuisance_hours:g} h: must lie from 0 to 1000 h")
     count = workers or os.cpu_count() or 1
-    if scores is not None:
+    if scores:
         if bags:
-            raise InputError(f"--scores {scores} and bags exclude each other: give one of them")
+            raise InputError(f"--scores {scores[0]} and bags exclude each other: give one of them")
         result = figures.from_json(scores)
     elif not bags:
         raise InputError("no bag: name bags or directories of bags")
