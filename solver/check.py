@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .quality import QualityReport
 from .scenario import Scenario
 from .simulation import OUTPUTS, Block, Simulation
 
@@ -26,10 +27,17 @@ class CheckRow:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What a finer step and basis change: a title that says which, and one row per quantity."""
+    """What a finer step and basis change, and how well the run itself closes.
+
+    Attributes:
+        title: what was refined.
+        rows: one per quantity.
+        quality: of the run as it is, its energy balance included.
+    """
 
     title: str
     rows: tuple[CheckRow, ...]
+    quality: QualityReport
 
 
 class _LowPass:
@@ -68,7 +76,7 @@ def check_run(
         update={"step": solution.step / 2, "frequency_limit": 1.25 * solution.frequency_limit}
     )
     runs = (
-        Simulation(scenario, outputs=OUTPUTS),
+        Simulation(scenario, outputs=OUTPUTS, balance=True),
         Simulation(scenario.model_copy(update={"solution": finer}), outputs=OUTPUTS),
     )
     edge = solution.frequency_limit / 4
@@ -108,4 +116,5 @@ def check_run(
             CheckRow(name, float(a), float(b), float(c / b) if b > 0 else 0.0)
             for name, a, b, c in zip(names, peaks[0], peaks[1], change, strict=True)
         ),
+        quality=runs[0].quality,
     )

@@ -17,8 +17,7 @@ from .errors import InputError
 from .irregularity import Profile, build_profile
 from .line import assemble
 from .local import LocalField, LocalWheel, contact_stiffness, local_wheel, low_pass
-from .modal import ModalRun
-from .modes import modal_line
+from .modal import ModalRun, modal_run
 from .motion import TrainMotion
 from .newmark import NewmarkRun
 from .scenario import Scenario, Train
@@ -215,6 +214,7 @@ class HybridRun:
         scenario: what to run.
         traffic: its trains at the step asked for.
         derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+        balance: balance the energy of the global set, see :class:`Simulation`.
 
     Raises:
         InputError: see :func:`crossover_frequency`; a wheel flat, or a polygon above the
@@ -226,7 +226,14 @@ class HybridRun:
         field: the local set.
     """
 
-    def __init__(self, scenario: Scenario, traffic: Traffic, derivatives: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        traffic: Traffic,
+        derivatives: tuple[int, ...],
+        *,
+        balance: bool = False,
+    ) -> None:
         self.scenario = scenario
         self.crossover = crossover_frequency(scenario)
         solution = scenario.solution
@@ -251,7 +258,9 @@ class HybridRun:
         if newmark:
             self._run = NewmarkRun(assemble(self._coarse_scenario), self._traffic, derivatives)
         else:
-            self._run = ModalRun(modal_line(self._coarse_scenario), self._traffic, derivatives)
+            self._run = modal_run(
+                self._coarse_scenario, self._traffic, derivatives, balance=balance
+            )
         self.field = LocalField(scenario, self.crossover, derivatives)
         self._filters = interpolation_filters(self.ratio)
         self._channels = len(scenario.channel)
@@ -275,6 +284,11 @@ class HybridRun:
     def equilibrium_residual(self) -> float:
         """Of the global set."""
         return self._run.equilibrium_residual
+
+    @property
+    def energy_residual(self) -> float | None:
+        """Of the global set."""
+        return self._run.energy_residual
 
     @property
     def channel_band(self) -> Real:

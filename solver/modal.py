@@ -28,8 +28,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from .contact import force_of, solve_contact
+from .energy import EnergyBalance
 from .errors import SolverError
-from .modes import RESIDUAL_STEP, ModalLine
+from .line import assemble
+from .modes import RESIDUAL_STEP, ModalLine, modal_line, solve_modal_line
+from .scenario import Scenario
 from .traffic import Running, Traffic
 from .vehicle import UnitStep, block_units, discretise, static_start
 
@@ -796,6 +799,7 @@ class ModalRun:
         precision: of the shapes and of the sums over modes; single precision changes forces and
             accelerations by less than 1e-4 of their peaks, the modes themselves are always double.
         marching: :func:`march` or its readable twin.
+        balance: energy balance of the same line, to be fed.
     """
 
     def __init__(
@@ -807,8 +811,10 @@ class ModalRun:
         order: int = 2,
         precision: type[np.floating] = np.float32,
         marching: Callable[..., tuple[int, float]] = march,
+        balance: EnergyBalance | None = None,
     ) -> None:
         self.line = line
+        self._balance = balance
         self.traffic = traffic
         self.tables = modal_tables(
             line, traffic.step, derivatives, order=order, precision=precision
@@ -934,9 +940,24 @@ class ModalRun:
         place = np.ascontiguousarray(position[:, columns])
         roughness = self.traffic.roughness(self._units, place, time)
         own_force = np.empty(place.shape)
-        lost, residual = self._march(
-            self.tables, self._modal, self._load, self._fleet, place, roughness, own_force, outputs
-        )
+        lost, residual = 0, 0.0
+        # the energy balance wants the state of every step
+        size = len(place) if self._balance is None else 1
+        for part in (slice(n, n + size) for n in range(0, len(place), size)):
+            before = None if self._balance is None else (self._modal.copy(), self._load.copy())
+            new_lost, new_residual = self._march(
+                self.tables,
+                self._modal,
+                self._load,
+                self._fleet,
+                place[part],
+                roughness[part],
+                own_force[part],
+                outputs[part],
+            )
+            lost, residual = lost + new_lost, max(residual, new_residual)
+            if before is not None:
+                self._sample(*before, place[part.start], own_force[part.start])
         force[:, columns] = own_force
         _dropped_answer(
             place, own_force, self.line.channel_x, self._residual, RESIDUAL_STEP, answer
@@ -947,6 +968,19 @@ class ModalRun:
             self.equilibrium_residual = max(
                 self.equilibrium_residual, residual / float(self._loads.max())
             )
+
+    def _sample(self, modal: Array, load: NDArray[np.floating], place: Array, force: Array) -> None:
+        """Give the energy balance a sample, from the state before it."""
+        assert self._balance is not None
+        tables = self.tables
+        new = self._balance.load(place, force)
+        amplitude = tables.unpack(modal).conj() + tables.unpack(tables.now) * new
+        self._balance.sample(amplitude + tables.unpack(tables.recall) * tables.unpack(load), new)
+
+    @property
+    def energy_residual(self) -> float | None:
+        """Of the energy balance, see :class:`EnergyBalance`; None without one."""
+        return None if self._balance is None else self._balance.residual
 
     def _check(self, time: Array, force: Array, outputs: Array) -> None:
         if self._units:
@@ -1036,3 +1070,13 @@ class ModalRun:
             first += size
             axle += axles
         return states, forces, places
+
+
+def modal_run(
+    scenario: Scenario, traffic: Traffic, derivatives: tuple[int, ...], *, balance: bool
+) -> ModalRun:
+    """Run of a scenario's line, its modes from the cache; with an energy balance computed anew."""
+    if not balance:
+        return ModalRun(modal_line(scenario), traffic, derivatives)
+    line, forms = solve_modal_line(assemble(scenario))
+    return ModalRun(line, traffic, derivatives, balance=EnergyBalance(line, forms, traffic.step))

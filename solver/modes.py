@@ -254,8 +254,30 @@ def reduced_modes(structure: Structure, limit: float) -> tuple[Array, Array]:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class LineForms:
+    """What the complex modes of a line are made of, for its energies.
+
+    Attributes:
+        omega: (n,) of the undamped modes of mass 1 (rad/s).
+        damping: (n, n) in their coordinates (1/s).
+        vectors: (n, K) complex modes in their coordinates.
+        frequency_limit: Hz.
+    """
+
+    omega: Array
+    damping: Array
+    vectors: Complex
+    frequency_limit: float
+
+
 def build_modal_line(structure: Structure) -> ModalLine:
     """Modal tables of a structure, computed."""
+    return solve_modal_line(structure)[0]
+
+
+def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
+    """Modal tables of a structure, and what its energies need beside them."""
     scenario = structure.scenario
     limit = scenario.solution.frequency_limit
     omega, real = reduced_modes(structure, REAL_MARGIN * limit)
@@ -298,7 +320,7 @@ def build_modal_line(structure: Structure) -> ModalLine:
         kept = ((thirds @ table[cell]) ** 2 @ static_weights).real
         residual[cell] = exact.reshape(-1, 4) - kept
     places = np.array([scenario.channel_x(channel) for channel in scenario.channel])
-    return ModalLine(
+    built = ModalLine(
         eigenvalues=values,
         weights=weights,
         grid_start=start,
@@ -318,6 +340,7 @@ def build_modal_line(structure: Structure) -> ModalLine:
         length=structure.length,
         solved=solved,
     )
+    return built, LineForms(omega, damping, vectors, limit)
 
 
 def _flexibility(structure: Structure) -> Array:

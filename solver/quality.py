@@ -14,7 +14,7 @@ class QualityReport:
         equilibrium_residual: largest |F - law(compression)| over all wheelsets and steps, divided
             by the static wheelset load (-).
         energy_residual: |work done - stored - dissipated| of the line, per work done or energy (-);
-            None where the full matrices are not at hand (exponential steps).
+            with exponential steps only when asked for (``balance``), else None.
         lost_contacts: number of times a wheelset on the line lifted off; with the linear law, times
             the force became tensile.
         valid_band: highest trustworthy frequency of every channel (Hz).

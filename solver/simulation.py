@@ -14,8 +14,7 @@ from .contact import compression_of, wheelset_law
 from .errors import InputError
 from .hybrid import HybridRun
 from .line import assemble
-from .modal import ModalRun
-from .modes import modal_line
+from .modal import ModalRun, modal_run
 from .motion import TrainMotion
 from .newmark import NewmarkRun
 from .quality import QualityReport
@@ -77,6 +76,8 @@ class Simulation:
         columns: which trains have columns in the blocks: ``all``, for the whole run, so that blocks
             can be joined; or those ``present``, within half a second of the block or nearer, and a
             train that has left is forgotten, so that a run without end keeps its cost and memory.
+        balance: balance the line's energy too where that is not had for nothing: with exponential
+            steps. The modes are then computed anew, and stepping costs about three times as much.
         report: called with one-line messages on what is being prepared.
 
     Raises:
@@ -94,6 +95,7 @@ class Simulation:
         *,
         outputs: Sequence[Output] = ("acceleration",),
         columns: Literal["all", "present"] = "all",
+        balance: bool = False,
         report: Callable[[str], None] | None = None,
     ) -> None:
         tell = report or (lambda message: None)
@@ -111,11 +113,11 @@ class Simulation:
         tell("modes of the line: computed once, then kept")
         self._run: ModalRun | HybridRun | NewmarkRun
         if scenario.solution.model == "hybrid":
-            self._run = HybridRun(scenario, self._traffic, derivatives)
+            self._run = HybridRun(scenario, self._traffic, derivatives, balance=balance)
         elif scenario.solution.integrator == "newmark":
             self._run = NewmarkRun(assemble(scenario), self._traffic, derivatives)
         else:
-            self._run = ModalRun(modal_line(scenario), self._traffic, derivatives)
+            self._run = modal_run(scenario, self._traffic, derivatives, balance=balance)
         tell(f"{self.states} modes; compiling or loading the stepping kernel")
 
     @property
@@ -144,11 +146,10 @@ class Simulation:
     @property
     def quality(self) -> QualityReport:
         """How far the samples so far can be trusted."""
-        run = self._run
         return QualityReport(
             samples=self._index,
             equilibrium_residual=self._run.equilibrium_residual,
-            energy_residual=run.energy_residual if isinstance(run, NewmarkRun) else None,
+            energy_residual=self._run.energy_residual,
             lost_contacts=self._run.lost_contacts,
             valid_band=dict(zip(self.channels, self._run.channel_band.tolist(), strict=True)),
             notes=self._run.notes,

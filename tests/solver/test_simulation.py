@@ -60,6 +60,27 @@ def test_energy_of_a_passage_balances():
     assert dissipated > 0.1 * work > 0
 
 
+@pytest.mark.parametrize("model", ["fe", "hybrid"])
+def test_a_run_balances_the_energy_of_its_line(model):
+    """Work of the wheels = loss + change of energy for the damping as it is: 0.1 %.
+
+    The motion is put together from the complex modes and weighed with M, C and K, so the balance
+    fails if stepping, normalisation or truncation is wrong.
+    """
+    solution = {"model": model, "end_time": 0.25}
+    if model == "hybrid":
+        solution |= {"frequency_limit": 2500.0, "step": 2.5e-5}
+    simulation = Simulation(build_scenario(table(solution=solution)), balance=True)
+    for _ in simulation.blocks(777):
+        pass
+    run = simulation._run if model == "fe" else simulation._run._run
+    work, lost, change = run._balance.totals()
+    assert lost > 0.1 * abs(change)
+    assert simulation.quality.energy_residual < 1e-3
+    # the same without a tenth of the loss does not close
+    assert abs(work - 0.9 * lost - change) > 5e-3 * max(abs(work), abs(change))
+
+
 @pytest.mark.parametrize("law", ["linear", "hertz"])
 def test_static_start_carries_the_weight_and_stays(law):
     scenario = table(

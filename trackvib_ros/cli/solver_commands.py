@@ -191,6 +191,12 @@ def _show_check(console: Console, scenario: Scenario) -> None:
             row.quantity, f"{row.peak:.6g}", f"{row.refined_peak:.6g}", f"{row.change:.3%}"
         )
     console.print(table)
+    balance = result.quality.energy_residual
+    if balance is not None:
+        console.print(
+            f"energy of the line: work less loss and change of energy is {balance:.1e} "
+            "of the work or the energy"
+        )
 
 
 scenarios = typer.Typer(help="Show scenario presets and the schema.", no_args_is_help=True)
