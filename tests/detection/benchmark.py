@@ -1,5 +1,7 @@
-"""The detector's figures on synthetic passages: ``python -m tests.detection.benchmark``.
+"""The detector's figures on noise-carried bursts: ``python -m tests.detection.benchmark``.
 
+A second opinion beside the solver's passages (``trackvib dataset accuracy`` and
+``trackvib evaluate --targets``): signals that no wheel of the solver ever made.
 Columns as in the design notes. Seeds of ``--set tuning`` and ``--set figures`` never meet: settings
 were chosen on the first, figures are told from the second.
 """
@@ -16,10 +18,8 @@ import numpy as np
 
 from tests.detection.synthetic import (
     CATALOGUE,
-    NUISANCES,
     RAILS,
     Passage,
-    nuisance,
     record,
 )
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
@@ -135,16 +135,6 @@ def run(job: tuple[str, dict, int]) -> tuple[str, list[dict]]:
     return name, out
 
 
-def quiet(job: tuple[str, int, float]) -> tuple[int, int]:
-    """Alarms and false trains in one stretch of nuisance."""
-    kind, seed, duration = job
-    rng = np.random.default_rng([seed, NUISANCES.index(kind)])
-    x = 10 ** rng.uniform(0.2, 2) * nuisance(kind, duration, RATE, rng)
-    events = detect(RATE, x + rng.standard_normal(x.size), RAILS[0])
-    false = [e for e in events if e.kind == "passage" and e.values["grade"] == CONFIRMED]
-    return sum(e.kind == "arrival" for e in events), len(false)
-
-
 def _p(values: list[float], scale: float) -> str:
     if not values:
         return "-"
@@ -157,7 +147,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--set", choices=list(SEEDS), default="figures")
-    parser.add_argument("--nuisance-minutes", type=float, default=60.0)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
@@ -169,9 +158,6 @@ def main() -> None:
     ]
     rows = {name: Row(name) for name in conditions()}
     raw = []
-    stretch = 20.0
-    count = round(options.nuisance_minutes * 60 / stretch / len(NUISANCES))
-    nuisances = [(kind, base + i, stretch) for kind in NUISANCES for i in range(count)]
     with ProcessPoolExecutor(options.workers) as pool:
         for name, results in pool.map(run, jobs, chunksize=2):
             row = rows[name]
@@ -198,7 +184,6 @@ def main() -> None:
                     row.true += r["true"]
                 elif r["trial"] == "one":
                     row.ratio_one.append(r["speed"] / r["sigma"])
-        calm = list(pool.map(quiet, nuisances, chunksize=2))
     print(
         "| condition | detected/extra | count exact | F1 | family | direction | 1 sensor p50/p95 % "
         "| 1 sensor, type known % | 2 sensors % | acceleration p50/p95 | onset latest ms "
@@ -219,9 +204,6 @@ def main() -> None:
             f"| {1e3 * max(row.onset, default=0):.0f} | {_p(row.arrival, 1e3)} "
             f"| {_p(row.departure, 1e3)} | {rms[0]:.2f}, {rms[1]:.2f} | {inside:.3g} |"
         )
-    hours = len(nuisances) * stretch / 3600
-    alarms, false = (sum(c[k] for c in calm) for k in (0, 1))
-    print(f"\nnuisances, {hours:.2g} h: {alarms} vibration events, {false} false trains confirmed")
     if options.json:
         options.json.write_text(json.dumps(raw, indent=1, default=float), "utf-8")
 

@@ -34,6 +34,7 @@ from trackvib_ros.nuisances import CHANNELS, KINDS, Calm, nuisance
 from trackvib_ros.scores import (
     calibration,
     confusion,
+    figure,
     from_json,
     grouped,
     json_schema,
@@ -131,6 +132,15 @@ def test_errors_are_found_minus_true(tmp_path):
         from_json([tmp_path / "scores.json"] * 2)
     assert set(json_schema()["properties"]) == set(json.loads(text))
     assert len(tables(result)) == 2
+
+
+def test_figure_is_drawn_once(tmp_path):
+    events = [passage_event(speed=Estimate(50 + 0.1 * k, 0.25, "m/s")) for k in range(5)]
+    result = Evaluation("d", [scored([event], [truth()]) for event in events])
+    figure(result, tmp_path / "f.png")
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(InputError, match="exists"):
+        figure(result, tmp_path / "f.png")
 
 
 def test_missed_passage():
