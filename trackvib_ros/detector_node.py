@@ -16,7 +16,7 @@ from trackvib_ros import messages as m
 from trackvib_ros.detection import Channel, TrainEvent
 from trackvib_ros.intake import Intake
 from trackvib_ros.outbox import Outbox
-from trackvib_ros.process import Stop, declare, transition, value
+from trackvib_ros.process import Stop, prepare, transition, value
 from trackvib_ros.recorder import Recorder
 from trackvib_ros.settings import DETECTOR_SETTINGS
 
@@ -36,7 +36,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         self._inputs: list[tuple[str, Any]] = []
         self._recorder: Recorder | None = None
         self._outbox = Outbox(self)
-        declare(self, DETECTOR_SETTINGS)
+        prepare(self, DETECTOR_SETTINGS)
         for topic in (m.DIAGNOSTICS, m.TRAIN_EVENTS, m.TRAIN_OCCUPIED, m.TRAIN_SPEED):
             self._outbox.open(topic)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -86,7 +86,7 @@ def free_domain() -> int:
 
 
 def profile_path() -> str:
-    """The shipped Fast DDS profile, with frequent announcements at the start."""
+    """The shipped Fast DDS profile: announcements at the start, bounded histories."""
     return str(resources.files("trackvib_ros").joinpath("config").joinpath("dds_profile.xml"))
 
 

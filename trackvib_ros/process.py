@@ -26,10 +26,13 @@ from rcl_interfaces.msg import (
 )
 from rclpy.exceptions import ParameterUninitializedException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+
+RCLError = rclpy_implementation.RCLError
 
 IDLE_S = 0.05
 """Longest wait of the loop (s): a signal is noticed after at most this time."""
@@ -101,7 +104,7 @@ class Worker(Protocol):
 
 @dataclass(frozen=True)
 class Setting:
-    """A ROS parameter: default (or type, if it may be unset), meaning with unit, range."""
+    """A ROS parameter: default (or type of an array, empty), meaning with unit, range."""
 
     name: str
     default: bool | int | float | str | Parameter.Type
@@ -112,8 +115,12 @@ class Setting:
     fixed: bool = False
 
 
-def declare(node: LifecycleNode, settings: Sequence[Setting]) -> None:
-    """Declare parameters so that ``ros2 param describe`` tells all and wrong values are refused."""
+def prepare(node: LifecycleNode, settings: Sequence[Setting]) -> None:
+    """Make the node answer ``ros2 param`` and ``ros2 lifecycle`` as one of rclcpp does.
+
+    Parameters are declared so that their description tells all and wrong values are refused; a
+    transition that the present state does not have is refused instead of ending the process.
+    """
     for setting in settings:
         note = "; change it in state unconfigured" if setting.fixed else ""
         descriptor = ParameterDescriptor(
@@ -129,6 +136,8 @@ def declare(node: LifecycleNode, settings: Sequence[Setting]) -> None:
                     FloatingPointRange(from_value=setting.low, to_value=setting.high, step=0.0)
                 ]
         node.declare_parameter(setting.name, setting.default, descriptor)
+        if value(node, setting.name) is None:  # one unset would hide all from ros2 param dump
+            node.set_parameters([Parameter(setting.name, setting.default, [])])
     fixed = {setting.name for setting in settings if setting.fixed}
 
     def check(parameters: list[Parameter]) -> SetParametersResult:
@@ -143,10 +152,20 @@ def declare(node: LifecycleNode, settings: Sequence[Setting]) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
+    change = node._service_change_state.callback
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return change(request, response)
+        except RCLError:
+            response.success = False
+            return response
+
+    node._service_change_state.callback = answer
 
 
 def value(node: Node, name: str) -> Any:
-    """Value of a declared parameter, None while unset."""
+    """Value of a declared parameter."""
     try:
         return node.get_parameter(name).value
     except ParameterUninitializedException:

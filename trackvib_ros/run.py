@@ -188,6 +188,7 @@ class Run:
                 step.start_ns, self.station.scenario, step.trains, step.wheelsets
             )
             self._outbox.put(m.MARKERS, message)
+            self._outbox.flush()
 
     def components(self) -> list[Component]:
         """What ``/diagnostics`` says about the run."""

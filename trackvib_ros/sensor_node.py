@@ -15,8 +15,8 @@ from trackvib_ros import messages as m
 from trackvib_ros.process import (
     Interrupted,
     Stop,
-    declare,
     in_background,
+    prepare,
     transition,
     value,
 )
@@ -35,7 +35,7 @@ class SensorNode(LifecycleNode):  # type: ignore[misc]
         self.run: Run | None = None
         self._active = False
         self._resets = 0
-        declare(self, SENSOR_SETTINGS)
+        prepare(self, SENSOR_SETTINGS)
         self.add_post_set_parameters_callback(self._on_parameters)
         self._diagnostics = self.create_publisher(
             m.DIAGNOSTICS.type, m.DIAGNOSTICS.name, m.DIAGNOSTICS.qos

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -47,14 +48,26 @@ def own_domain(monkeypatch: pytest.MonkeyPatch, offset: int = 0) -> int:
 
 
 class Graph:
-    """ROS inside the test: nodes that are spun, and told to work, while something is awaited."""
+    """ROS inside the test: nodes that are spun, and told to work, while something is awaited.
 
-    def __init__(self) -> None:
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        self.executor = SingleThreadedExecutor()
+    Args:
+        domain: of the tester; that of the environment if not given.
+    """
+
+    def __init__(self, domain: int | None = None) -> None:
+        self._context = None if domain is None else Context()
+        rclpy.init(
+            args=[],
+            context=self._context,
+            domain_id=domain,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self.executor = SingleThreadedExecutor(context=self._context)
         self.workers: list[Any] = []
         self.nodes: list[Node] = []
-        self.tester = self.add(rclpy.create_node("tester", start_parameter_services=False))
+        self.tester = self.add(
+            rclpy.create_node("tester", context=self._context, start_parameter_services=False)
+        )
 
     def add(self, node: Node) -> Any:
         self.executor.add_node(node)
@@ -99,7 +112,7 @@ class Graph:
         self.executor.shutdown()
         for node in self.nodes:
             node.destroy_node()
-        rclpy.try_shutdown()
+        rclpy.try_shutdown(context=self._context)
 
 
 def graph_of_test() -> Iterator[Graph]:
@@ -114,9 +127,11 @@ class Processes:
     def __init__(self) -> None:
         self._started: list[subprocess.Popen[str]] = []
 
-    def start(self, *arguments: str, **environment: str) -> subprocess.Popen[str]:
+    def start(
+        self, *arguments: str, program: str = sys.executable, **environment: str
+    ) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, *arguments],
+            [program, *arguments],
             env={**os.environ, **environment},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -129,6 +144,11 @@ class Processes:
     def command(self, *arguments: str, **environment: str) -> subprocess.Popen[str]:
         code = "from trackvib_ros.cli import main; main()"
         return self.start("-c", code, *arguments, **environment)
+
+    def executable(self, path: Path, *arguments: str) -> subprocess.Popen[str]:
+        """A script that finds this Python as ``python3`` on the PATH."""
+        search = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        return self.start(*arguments, program=str(path), PATH=search)
 
     def node(self, name: str, **parameters: object) -> subprocess.Popen[str]:
         arguments = ["-m", "trackvib_ros.start", name, "--ros-args", "-p", "autostart:=true"]

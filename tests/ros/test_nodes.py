@@ -16,6 +16,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.callback_groups import CallbackGroup
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
@@ -27,6 +28,19 @@ from trackvib_ros.settings import SENSOR_SETTINGS
 from trackvib_ros.waveform import Waveform
 
 pytestmark = pytest.mark.ros
+
+
+class Untouched(CallbackGroup):  # type: ignore[misc]
+    """Subscriptions that the executor leaves alone."""
+
+    def can_execute(self, entity: object) -> bool:
+        return False
+
+    def beginning_execution(self, entity: object) -> bool:
+        return False
+
+    def ending_execution(self, entity: object) -> None:
+        pass
 
 
 @pytest.fixture
@@ -279,6 +293,30 @@ def test_detector_survives_counts_and_reports_hostile_messages(graph: Graph) -> 
     graph.until(lambda: figures(heard, "detector: input").get("restarts") == "1", "the restart")
     assert figures(heard, "detector: input")["blocks gauge/waveform"] == "8"
     assert state(graph, "detector") == "active"
+
+
+def test_a_reader_that_takes_nothing_holds_the_run_back_and_loses_nothing(graph: Graph) -> None:
+    node = sensor_of(graph, ground_truth=False, await_detectors=1, headway_mean=60.0)
+    topic = m.waveform_topic("rail")
+    taken: list[int] = []
+    slow = graph.tester.create_subscription(
+        topic.type, topic.name, taken.append, topic.qos, callback_group=Untouched()
+    )
+    graph.listen(m.waveform_topic("bridge"))
+    node.trigger_configure()
+    node.trigger_activate()
+    graph.until(lambda: node.run.state == "blocked", "a full middleware")
+    (_, _, told) = node.run.components()[-1]
+    assert told["published rail/waveform"] == 400  # 200 on either side: config/dds_profile.xml
+
+    def take() -> int:
+        with slow.handle:
+            while found := slow.handle.take_message(slow.msg_type, False):
+                taken.append(m.from_stamp(found[0].header.stamp))
+        return len(taken)
+
+    graph.until(lambda: take() >= 500, "further blocks")
+    assert taken == [20_000_000 * k for k in range(len(taken))]
 
 
 def test_detector_refuses_lists_that_do_not_fit(graph: Graph) -> None:

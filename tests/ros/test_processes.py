@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -104,6 +105,43 @@ def test_killed_detector_is_missed_by_the_sensor_which_goes_on(
     sensor.send_signal(signal.SIGINT)
     status, text = ended(sensor)
     assert status == 0, text
+
+
+def test_domains_keep_two_sites_apart(
+    graph: Graph, processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same names in two ROS domains on one machine, at once."""
+    own = int(os.environ["ROS_DOMAIN_ID"])
+    foreign = own + 70
+    other = tmp_path / "other.toml"
+    other.write_text(QUICK.read_text(encoding="utf-8").replace("200 km/h", "120 km/h"))
+    neighbour = Graph(foreign)
+    try:
+        heard = [site.listen(m.TRAIN_EVENTS) for site in (graph, neighbour)]
+        clocks = [site.listen(m.CLOCK) for site in (graph, neighbour)]
+        for domain, scenario in ((own, SCENARIO), (foreign, str(other))):
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+            processes.node("detector", use_sim_time=True)
+            processes.node("sensor", scenario=scenario, real_time_factor=0.0, await_detectors=1)
+
+        def both_heard() -> bool:
+            neighbour.once()
+            return all(passages(events) for events in heard)
+
+        graph.until(both_heard, "a passage in both domains")
+        for site, events, clock, speed in zip(
+            (graph, neighbour), heard, clocks, (200, 120), strict=True
+        ):
+            (passage,) = passages(events)
+            # loose: whose train it is matters here, how well it is measured does not
+            assert passage.values["speed"].value * 3.6 == pytest.approx(speed, rel=0.1)
+            names = [name for name, _ in site.tester.get_node_names_and_namespaces()]
+            assert sorted(names) == ["detector", "sensor", "tester"]
+            assert site.tester.count_publishers("/clock") == 1
+            times = [m.from_stamp(message.clock) for message in clock]
+            assert times == sorted(times)
+    finally:
+        neighbour.close()
 
 
 def test_namespaces_keep_two_sites_apart(

@@ -71,9 +71,8 @@ def _node(module: str, parameters: dict[str, object], namespace: str) -> None:
     environment.domain_of(os.environ)
     environment.complete(os.environ)
     site = "/" + namespace.strip("/")
-    arguments = ["trackvib", "--ros-args", "-r", f"__ns:={site}"]
-    if site != "/":  # simulated time is the site's own: two sites in one domain do not mix
-        arguments += ["-r", f"/clock:={site}/clock"]
+    # simulated time is the site's own: two sites in one domain do not mix
+    arguments = ["trackvib", "--ros-args", "-r", f"__ns:={site}", "-r", "/clock:=clock"]
     for name, setting in parameters.items():
         text = str(setting).lower() if isinstance(setting, bool) else str(setting)
         arguments += ["-p", f"{name}:={text}"]

@@ -29,7 +29,7 @@ def _managed(name: str, parameters: list) -> list:
         name=name,
         namespace=LaunchConfiguration("namespace"),
         parameters=parameters,
-        remappings=[("/clock", [LaunchConfiguration("namespace"), "/clock"])],
+        remappings=[("/clock", "clock")],  # simulated time is the site's own
         output="screen",
         sigterm_timeout="5",
     )
