@@ -39,10 +39,7 @@ from .vehicle import UnitStep, block_units, discretise, static_start
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-LANES = 16
-TILE = 400
-"""Most modes that are taken through a whole step at a time, so that they stay cached."""
-
+LANES = 32
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 """Freedoms given to the compiler; not-a-number and infinity keep their meaning."""
 
@@ -82,16 +79,15 @@ def exponential_weights(eigenvalues: Complex, step: float, order: int) -> tuple[
 class ModalTables:
     """A :class:`ModalLine` made ready for one step length.
 
-    Modes are cut into Z tiles of T, a multiple of 16, padded with zeros. Weights are folded into
-    the shapes as square roots.
+    K is padded with zeros to a multiple of 32; weights are folded into the shapes as square roots.
 
     Attributes:
-        shapes: (Z, cells, 4, 2 T) cubic coefficients of the rail shapes, re then im.
-        decay, drive: (Z, 2, T) re and im of E and d.
-        now, recall: (Z, 2, T) re and im of a and -c/E.
+        shapes: (cells, 4, 2 K) cubic coefficients of the rail shapes, re then im.
+        decay, drive: (2, K) re and im of E and d.
+        now, recall: (2, K) re and im of a and -c/E.
         compliance: (2, cells, 4) m/N, cubic coefficients: displacement of the modes at a wheelset
             per its new force; residual compliance.
-        channel_weights: (O, Z 2 T) output = channel_weights @ (re, -im of y) + feed-through.
+        channel_weights: (O, 2 K) output = channel_weights @ (re, -im of y) + feed-through.
         channel_feed: (2, cells, 4, O) cubic coefficients of the feed-through per new, last force.
         start_weights: (K,) complex: y before sample 0 = start_weights p for a static p.
         grid_start, grid_step, length: m.
@@ -110,14 +106,10 @@ class ModalTables:
     grid_step: float
     length: float
 
-    def pack(self, values: Complex) -> Any:
-        """(K,) values of the modes in tiles, (Z, 2, T)."""
-        return _pack(values, len(self.decay))
-
-    def unpack(self, tiles: NDArray[np.floating]) -> Complex:
-        """(K,) complex values of tiles (Z, 2, T) or (Z, 2 T)."""
-        parts = tiles.astype(np.float64).reshape(self.decay.shape)
-        whole: Complex = (parts[:, 0] + 1j * parts[:, 1]).ravel()
+    def unpack(self, values: NDArray[np.floating]) -> Complex:
+        """Complex values of the modes without the padding, of (2, K) or (2 K,)."""
+        parts = values.astype(np.float64).reshape(self.decay.shape)
+        whole: Complex = parts[0] + 1j * parts[1]
         return whole[: len(self.start_weights)]
 
 
@@ -129,15 +121,11 @@ def aligned(shape: tuple[int, ...], precision: np.dtype | type[np.floating]) -> 
     return memory[begin : begin + size].view(precision).reshape(shape)
 
 
-def _pack(values: Complex, tiles: int, precision: type[np.floating] = np.float64) -> Any:
-    """Modes on the last axis, (..., K), cut into tiles: (..., Z, 2, T)."""
+def pack(values: Complex, precision: type[np.floating] = np.float64) -> Any:
+    """Modes on the last axis, re and im one after the other and padded: (..., 2, K)."""
     *others, modes = values.shape
-    size = -(-modes // (tiles * LANES)) * LANES
-    padded = np.zeros((*others, tiles * size), dtype=np.complex128)
-    padded[..., :modes] = values
-    cut = padded.reshape(*others, tiles, size)
-    packed = aligned((*others, tiles, 2, size), precision)
-    packed[..., 0, :], packed[..., 1, :] = cut.real, cut.imag
+    packed = aligned((*others, 2, -(-modes // LANES) * LANES), precision)
+    packed[..., 0, :modes], packed[..., 1, :modes] = values.real, values.imag
     return packed
 
 
@@ -159,7 +147,6 @@ def modal_tables(
         precision: of the shapes of rail and channels.
     """
     modes = len(line.eigenvalues)
-    tiles = -(-modes // TILE)
     root = np.sqrt(line.weights)
     cells = len(line.rail_shapes)
     shapes = line.rail_shapes * root
@@ -167,11 +154,7 @@ def modal_tables(
     decay, now, last, before = exponential_weights(lam, step, order)
     recall = -before / decay
 
-    size = 2 * _pack(lam, tiles).shape[2]
-    packed = aligned((tiles, cells, 4, size), precision)
-    for power in range(4):
-        part = _pack(shapes[:, power], tiles, precision)
-        packed[:, :, power] = part.reshape(cells, tiles, size).swapaxes(0, 1)
+    packed = pack(shapes, precision).reshape(cells, 4, -1)
 
     ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
     slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
@@ -186,19 +169,19 @@ def modal_tables(
         direct = channel * lam if derivative == 2 else 0.0 * channel
         feeds.append(((observe * now + direct).T, (observe * recall).T))
     outputs = len(derivatives) * len(channel)
-    channel_weights = aligned((outputs, tiles * size), precision)
+    channel_weights = aligned((outputs, packed.shape[2]), precision)
     channel_feed = np.zeros((2, cells, 4, outputs))
     if outputs:
-        channel_weights[:] = _pack(np.concatenate(weights), tiles).reshape(outputs, -1)
+        channel_weights[:] = pack(np.concatenate(weights)).reshape(outputs, -1)
         for row in range(2):
             matrix = np.concatenate([feed[row] for feed in feeds], axis=1)
             channel_feed[row] = (shapes.reshape(-1, modes) @ matrix).real.reshape(cells, 4, outputs)
     return ModalTables(
         shapes=packed,
-        decay=_pack(decay, tiles),
-        drive=_pack(decay * now + last - recall, tiles),
-        now=_pack(now, tiles),
-        recall=_pack(recall, tiles),
+        decay=pack(decay),
+        drive=pack(decay * now + last - recall),
+        now=pack(now),
+        recall=pack(recall),
         compliance=np.stack([own, line.residual]),
         channel_weights=channel_weights,
         channel_feed=channel_feed,
@@ -308,8 +291,8 @@ def march(
 
     Args:
         tables: of the line.
-        modal: (Z, 2, T) re and -im of the state y, overwritten.
-        load: (Z, 2, T) re and im of p at the last sample, overwritten.
+        modal: (2, K) re and -im of the state y, overwritten.
+        load: (2, K) re and im of p at the last sample, overwritten.
         fleet: units on or near the line; their state is overwritten.
         position: (n, W) m of the fleet's axles.
         roughness: (n, W) m, irregularity plus wheel defects under them.
@@ -320,7 +303,7 @@ def march(
         number of times an axle lost contact on the line, largest equilibrium residual (N).
     """
     axles, precision = position.shape[1], tables.shapes.dtype
-    tiles, _, size = tables.decay.shape
+    size = tables.decay.shape[1]
     lost, residual = _march(
         tables.shapes,
         tables.decay,
@@ -335,10 +318,10 @@ def march(
         tables.length,
         modal,
         load,
-        aligned((tiles, axles + 1, 2 * size), precision),
+        aligned((axles + 1, 2 * size), precision),
         aligned((2, size), precision),
         aligned((2, size), precision),
-        aligned((CHUNK, tiles, 2 * size), precision),
+        aligned((CHUNK, 2 * size), precision),
         fleet.kind,
         fleet.first,
         fleet.transition,
@@ -369,91 +352,100 @@ CHUNK = 8
 KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
 
-# Arrays come whole, with the tile as an index: making a slice costs as much as 100 modes here.
+# Arrays come whole, with an index: making a slice costs as much as the work on 100 modes.
 @njit(**KERNEL)
-def _shape_at(shapes, t, cell, s, shape, i):  # type: ignore[no-untyped-def]
-    """Rail shapes of tile t at s in a cell."""
-    for k in range(shape.shape[2]):
-        shape[t, i, k] = shapes[t, cell, 0, k] + s * (
-            shapes[t, cell, 1, k] + s * (shapes[t, cell, 2, k] + s * shapes[t, cell, 3, k])
+def _shape_two(shapes, c, d, s, r, shape, a, b, f, g, load):  # type: ignore[no-untyped-def]
+    """Rail shapes of wheelsets a and b, at s in cell c and at r in cell d, and their loads."""
+    for k in range(load.size):
+        v = shapes[c, 0, k] + s * (shapes[c, 1, k] + s * (shapes[c, 2, k] + s * shapes[c, 3, k]))
+        w = shapes[d, 0, k] + r * (shapes[d, 1, k] + r * (shapes[d, 2, k] + r * shapes[d, 3, k]))
+        shape[a, k] = v
+        shape[b, k] = w
+        load[k] += f * v + g * w
+
+
+@njit(**KERNEL)
+def _read_shapes(shapes, cell, place, here, count, shape, force, load):  # type: ignore[no-untyped-def]
+    """Shapes under the wheelsets on the line, and the sum of shapes times forces."""
+    for k in range(load.size):
+        load[k] = 0.0
+    for m in range(0, count, 2):
+        a, b = here[m], here[m + 1]
+        _shape_two(
+            shapes, cell[a], cell[b], place[a], place[b], shape, a, b, force[a], force[b], load
         )
 
 
 @njit(**KERNEL)
-def _add_four(shape, t, a, b, c, d, f0, f1, f2, f3, load, row):  # type: ignore[no-untyped-def]
-    for k in range(load.shape[1]):
-        load[row, k] += (
-            f0 * shape[t, a, k] + f1 * shape[t, b, k] + f2 * shape[t, c, k] + f3 * shape[t, d, k]
-        )
+def _add_four(shape, a, b, c, d, f0, f1, f2, f3, load):  # type: ignore[no-untyped-def]
+    for k in range(load.size):
+        load[k] += f0 * shape[a, k] + f1 * shape[b, k] + f2 * shape[c, k] + f3 * shape[d, k]
 
 
 @njit(**KERNEL)
-def _sum_loads(shape, t, pushing, pushed, force, load, row):  # type: ignore[no-untyped-def]
+def _sum_loads(shape, pushing, pushed, force, load):  # type: ignore[no-untyped-def]
     """Sum of shapes times forces over the wheelsets that push."""
-    for k in range(load.shape[1]):
-        load[row, k] = 0.0
+    for k in range(load.size):
+        load[k] = 0.0
     for m in range(0, pushed, 4):
         a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
-        _add_four(shape, t, a, b, c, d, force[a], force[b], force[c], force[d], load, row)
+        _add_four(shape, a, b, c, d, force[a], force[b], force[c], force[d], load)
 
 
 @njit(**KERNEL)
-def _step_modes(decay, drive, t, load, modal):  # type: ignore[no-untyped-def]
+def _step_modes(decay, drive, load, modal):  # type: ignore[no-untyped-def]
     """y = E y + d p; modal holds -im of y, so that a real part is a plain scalar product."""
-    for k in range(modal.shape[2]):
-        x, y, p, q = modal[t, 0, k], modal[t, 1, k], load[t, 0, k], load[t, 1, k]
-        e, f, a, b = decay[t, 0, k], decay[t, 1, k], drive[t, 0, k], drive[t, 1, k]
-        modal[t, 0, k] = e * x + f * y + a * p - b * q
-        modal[t, 1, k] = e * y - f * x - a * q - b * p
-
-
-@njit(**KERNEL)
-def _decay_modes(decay, t, modal):  # type: ignore[no-untyped-def]
-    """y = E y."""
-    for k in range(modal.shape[2]):
-        x, y, e, f = modal[t, 0, k], modal[t, 1, k], decay[t, 0, k], decay[t, 1, k]
-        modal[t, 0, k] = e * x + f * y
-        modal[t, 1, k] = e * y - f * x
-
-
-@njit(**KERNEL)
-def _predict(now, recall, t, guess, load, modal, predicted):  # type: ignore[no-untyped-def]
-    """q = y + a p - (c/E) p' with p guessed; predicted holds -im of q."""
-    for k in range(modal.shape[2]):
-        p, q, r, s = guess[0, k], guess[1, k], load[t, 0, k], load[t, 1, k]
-        a, b, c, d = now[t, 0, k], now[t, 1, k], recall[t, 0, k], recall[t, 1, k]
-        predicted[0, k] = modal[t, 0, k] + a * p - b * q + c * r - d * s
-        predicted[1, k] = modal[t, 1, k] - a * q - b * p - c * s - d * r
-
-
-@njit(**KERNEL)
-def _keep(modal, t, history, row):  # type: ignore[no-untyped-def]
     for k in range(modal.shape[1]):
-        history[row, t, k] = modal[t, k]
+        x, y, p, q = modal[0, k], modal[1, k], load[0, k], load[1, k]
+        e, f, a, b = decay[0, k], decay[1, k], drive[0, k], drive[1, k]
+        modal[0, k] = e * x + f * y + a * p - b * q
+        modal[1, k] = e * y - f * x - a * q - b * p
 
 
 @njit(**KERNEL)
-def _dot_four(weights, row, values, t, a, b, c, d):  # type: ignore[no-untyped-def]
+def _decay_modes(decay, modal):  # type: ignore[no-untyped-def]
+    """y = E y."""
+    for k in range(modal.shape[1]):
+        x, y, e, f = modal[0, k], modal[1, k], decay[0, k], decay[1, k]
+        modal[0, k] = e * x + f * y
+        modal[1, k] = e * y - f * x
+
+
+@njit(**KERNEL)
+def _predict(now, recall, guess, load, modal, predicted):  # type: ignore[no-untyped-def]
+    """q = y + a p - (c/E) p' with p guessed; predicted holds -im of q."""
+    for k in range(modal.shape[1]):
+        p, q, r, s = guess[0, k], guess[1, k], load[0, k], load[1, k]
+        a, b, c, d = now[0, k], now[1, k], recall[0, k], recall[1, k]
+        predicted[0, k] = modal[0, k] + a * p - b * q + c * r - d * s
+        predicted[1, k] = modal[1, k] - a * q - b * p - c * s - d * r
+
+
+@njit(**KERNEL)
+def _keep(modal, history, row):  # type: ignore[no-untyped-def]
+    for k in range(modal.size):
+        history[row, k] = modal[k]
+
+
+@njit(**KERNEL)
+def _dot_four(weights, row, values, a, b, c, d):  # type: ignore[no-untyped-def]
     zero = weights.dtype.type(0)
     p, q, r, s = zero, zero, zero, zero
     for k in range(weights.shape[1]):
-        p += weights[row, k] * values[t, a, k]
-        q += weights[row, k] * values[t, b, k]
-        r += weights[row, k] * values[t, c, k]
-        s += weights[row, k] * values[t, d, k]
+        p += weights[row, k] * values[a, k]
+        q += weights[row, k] * values[b, k]
+        r += weights[row, k] * values[c, k]
+        s += weights[row, k] * values[d, k]
     return p, q, r, s
 
 
 @njit(**KERNEL)
-def _add_dots(shape, t, pushing, pushed, modes, displacement):  # type: ignore[no-untyped-def]
-    """displacement += what the modes of a tile move the rail at every wheelset that pushes."""
+def _displace(shape, pushing, pushed, modes, displacement):  # type: ignore[no-untyped-def]
+    """What the modes move the rail at every wheelset that pushes."""
     for m in range(0, pushed, 4):
         a, b, c, d = pushing[m], pushing[m + 1], pushing[m + 2], pushing[m + 3]
-        p, q, r, s = _dot_four(modes, 0, shape, t, a, b, c, d)
-        displacement[a] += p
-        displacement[b] += q
-        displacement[c] += r
-        displacement[d] += s
+        p, q, r, s = _dot_four(modes, 0, shape, a, b, c, d)
+        displacement[a], displacement[b], displacement[c], displacement[d] = p, q, r, s
 
 
 @njit(**KERNEL)
@@ -466,7 +458,7 @@ def _observe(history, weights, begin, end, outputs):  # type: ignore[no-untyped-
     for n in range(0, end - begin, 4):
         at, left = begin + n, end - begin - n
         for o in range(weights.shape[0]):
-            p, q, r, s = _dot_four(weights, o, history, 0, n, n + 1, n + 2, n + 3)
+            p, q, r, s = _dot_four(weights, o, history, n, n + 1, n + 2, n + 3)
             outputs[at, o] += p
             if left > 1:
                 outputs[at + 1, o] += q
@@ -546,22 +538,20 @@ def _march(  # type: ignore[no-untyped-def]
     force,
     outputs,
 ):
-    tiles, _, size = decay.shape
     samples, axles = position.shape
-    last_cell = shapes.shape[1] - 1
-    flat_modal, flat_load = modal.reshape(tiles, 2 * size), load.reshape(tiles, 2 * size)
-    flat_guess, flat_predicted = guess.reshape(1, 2 * size), predicted.reshape(1, 2 * size)
-    flat_history = history.reshape(1, len(history), tiles * 2 * size)
+    last_cell = len(shapes) - 1
+    flat_modal, flat_load, flat_guess = modal.ravel(), load.ravel(), guess.ravel()
+    flat_predicted = predicted.reshape(1, 2 * predicted.shape[1])
     rows = len(history)
     lost = 0
     worst = 0.0
     # the wheelsets on the line, filled up to a multiple of four with one that never pushes
     count, pushed = 0, 0
     here, pushing = np.full(axles + 4, axles), np.full(axles + 4, axles)
-    cell, place = np.zeros(axles + 1, np.int64), np.zeros(axles + 1)
-    push = np.zeros(axles + 1, shapes.dtype)
+    cell, local = np.zeros(axles + 1, np.int64), np.zeros(axles + 1)
+    place, push = np.zeros(axles + 1, shapes.dtype), np.zeros(axles + 1, shapes.dtype)
     displacement, gap, own = np.zeros(axles + 1), np.empty(axles), np.empty(axles)
-    # tile by tile: the last sample's forces on the modes, then the prediction of this one
+    # a turn is the last sample's forces on the modes, then the prediction and forces of this one
     for n in range(samples + 1):
         row = n % rows
         if n < samples:
@@ -571,32 +561,27 @@ def _march(  # type: ignore[no-untyped-def]
                 if 0.0 <= x <= length:
                     at = (x - grid_start) / grid_step
                     cell[i] = min(int(at), last_cell)
-                    place[i] = at - cell[i]
-                    displacement[i] = 0.0
+                    local[i] = at - cell[i]
                     here[count] = i
                     count += 1
             here[count : count + 3] = axles
             for o in range(outputs.shape[1]):
                 outputs[n, o] = 0.0
-        for t in range(tiles):
-            if n > 0:
-                if pushed > 0:
-                    _sum_loads(shape, t, pushing, pushed, push, flat_load, t)
-                    _step_modes(decay, drive, t, load, modal)
-                else:
-                    _decay_modes(decay, t, modal)
-            if n < samples:
-                _keep(flat_modal, t, history, row)
-                if count > 0:
-                    for m in range(count):
-                        i = here[m]
-                        _shape_at(shapes, t, cell[i], shapes.dtype.type(place[i]), shape, i)
-                        push[i] = last_force[i]
-                    _sum_loads(shape, t, here, count, push, flat_guess, 0)
-                    _predict(now_weight, recall, t, guess, load, modal, predicted)
-                    _add_dots(shape, t, here, count, flat_predicted, displacement)
+        if n > 0 and pushed > 0:
+            _sum_loads(shape, pushing, pushed, push, flat_load)
+            _step_modes(decay, drive, load, modal)
+        elif n > 0:
+            _decay_modes(decay, modal)
         if n == samples:
             break
+        _keep(flat_modal, history, row)
+        if count > 0:
+            for m in range(count):
+                push[here[m]] = last_force[here[m]]
+                place[here[m]] = local[here[m]]
+            _read_shapes(shapes, cell, place, here, count, shape, push, flat_guess)
+            _predict(now_weight, recall, guess, load, modal, predicted)
+            _displace(shape, here, count, flat_predicted, displacement)
         for u in range(kind.size):
             t = kind[u]
             begin = first[u]
@@ -619,7 +604,7 @@ def _march(  # type: ignore[no-untyped-def]
                 if not 0.0 <= x <= length:
                     force[n, i] = solve_contact(gap[i], own[i], linear[i], hertz[i])
                     continue
-                s = place[i]
+                s = local[i]
                 modes = _cubic(compliance, 0, cell[i], s)
                 gap[i] += modes * last_force[i] - displacement[i]
                 own[i] += modes + _cubic(compliance, 1, cell[i], s)
@@ -658,16 +643,15 @@ def _march(  # type: ignore[no-untyped-def]
                 else:
                     force[n, i] = np.nan
         if pushed > 0 and count == 0:
-            for t in range(tiles):
-                for k in range(2 * size):
-                    flat_load[t, k] = 0.0
+            for k in range(flat_load.size):
+                flat_load[k] = 0.0
         pushed = count
         for m in range(count + 3):
             pushing[m] = here[m]
         for m in range(count):
             push[here[m]] = last_force[here[m]]
         if row == rows - 1 or n == samples - 1:
-            _observe(flat_history, channel_weights, n - row, n + 1, outputs)
+            _observe(history, channel_weights, n - row, n + 1, outputs)
     return lost, worst
 
 
@@ -689,13 +673,13 @@ def march_reference(
 
     def locate(x: float) -> tuple[int, Array]:
         at = (x - tables.grid_start) / tables.grid_step
-        cell = min(int(at), tables.shapes.shape[1] - 1)
+        cell = min(int(at), len(tables.shapes) - 1)
         return cell, np.asarray((at - cell) ** np.arange(4), np.float64)
 
     def shape_at(x: float) -> Complex:
         cell, powers = locate(x)
         return sum(
-            (power * tables.unpack(tables.shapes[:, cell, j]) for j, power in enumerate(powers)),
+            (power * tables.unpack(tables.shapes[cell, j]) for j, power in enumerate(powers)),
             np.zeros_like(decay),
         )
 
@@ -752,7 +736,7 @@ def march_reference(
             fleet.force[axles], fleet.place[axles] = new, x
             force[n, axles] = np.where(on, new, np.nan)
         y = decay * y + drive * p
-        modal[:], load[:] = tables.pack(y.conj()), tables.pack(p)
+        modal[:], load[:] = pack(y.conj()), pack(p)
     return lost, float(worst)
 
 
@@ -1057,8 +1041,8 @@ class ModalRun:
         if on_line.any():
             load = (shapes * np.sqrt(weights)).T @ force
             y = self.tables.start_weights * load
-            self._load += self.tables.pack(load)
-            self._modal += self.tables.pack(y.conj())
+            self._load += pack(load)
+            self._modal += pack(y.conj())
         states, forces, first, axle = [], [], 0, 0
         for unit in units:
             size, axles = len(unit.unit.weight), len(unit.unit.wheelsets)
