@@ -772,6 +772,32 @@ def _dropped_answer(  # type: ignore[no-untyped-def]
                         answer[n, c, order] += force[n, i] * value
 
 
+@njit(**KERNEL)
+def _rate(values, n, c, part, order, step):  # type: ignore[no-untyped-def]
+    """Derivative of a column at row n by central differences."""
+    if order == 0:
+        return values[n, c, part]
+    if order == 1:
+        return (values[n + 1, c, part] - values[n - 1, c, part]) / (2 * step)
+    if order == 2:
+        ends = values[n + 1, c, part] + values[n - 1, c, part]
+        return (ends - 2 * values[n, c, part]) / step**2
+    near = values[n + 1, c, part] - values[n - 1, c, part]
+    return (values[n + 2, c, part] - values[n - 2, c, part] - 2 * near) / (2 * step**3)
+
+
+@njit(**KERNEL)
+def _add_dropped(answer, derivative, step, signals, begin):  # type: ignore[no-untyped-def]
+    """Add the dropped modes' answer to the columns of one derivative."""
+    for n in range(signals.shape[0]):
+        for c in range(answer.shape[1]):
+            total = _rate(answer, n + 2, c, 1, derivative, step)
+            total += _rate(answer, n + 2, c, 2, derivative + 1, step)
+            if derivative > 0:
+                total += _rate(answer, n + 2, c, 0, derivative - 1, step)
+            signals[n, begin + c] += total
+
+
 class ModalRun:
     """A run by exponential stepping: the state of modes and units, advanced in chunks.
 
@@ -875,26 +901,11 @@ class ModalRun:
             np.concatenate(parts) for parts in zip(held, ahead, strict=True)
         )
         self._held = [part[-4:].copy() for part in (time, position, force, outputs, answer)]
-        now, step = slice(2, -2), self.traffic.step
-        h, g0, g1 = np.moveaxis(answer, 2, 0)
-
-        def rate(values: Array, order: int) -> Array:
-            a, b, c, d = values[:-4], values[1:-3], values[3:-1], values[4:]
-            return (
-                values[now],
-                (c - b) / (2 * step),
-                (c - 2 * values[now] + b) / step**2,
-                (d - 2 * c + 2 * b - a) / (2 * step**3),
-            )[order]
-
-        signals = outputs[now]
+        signals = outputs[2:-2]
         width = answer.shape[1]
         for number, derivative in enumerate(self._derivatives):
-            columns = slice(number * width, (number + 1) * width)
-            signals[:, columns] += rate(g0, derivative) + rate(g1, derivative + 1)
-            if derivative > 0:
-                signals[:, columns] += rate(h, derivative - 1)
-        return time[now], position[now], force[now], signals
+            _add_dropped(answer, derivative, self.traffic.step, signals, number * width)
+        return time[2:-2], position[2:-2], force[2:-2], signals
 
     def _march_on(self, samples: int) -> list[Array]:
         """Time, position, force, outputs of the kept modes, sums h, g0, g1 of :meth:`advance`."""
@@ -969,7 +980,7 @@ class ModalRun:
     def _check(self, time: Array, force: Array, outputs: Array) -> None:
         if self._units:
             limit = FORCE_LIMIT * self._loads
-            bad = ~(np.nanmax(np.abs(force), axis=0, initial=0.0) <= limit)
+            bad = ~(np.fmax.reduce(np.abs(force), axis=0, initial=0.0) <= limit)
             assert self._fleet is not None
             bad |= ~np.isfinite(self._fleet.force)
             if bad.any():

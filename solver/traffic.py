@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from .contact import wheelset_law
@@ -54,6 +55,29 @@ class Running:
     columns: slice
 
 
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _add_ends(
+    position: Array,
+    crossed: NDArray[np.bool_],
+    load: Array,
+    step: float,
+    rise: Array,
+    length: float,
+    values: Array,
+) -> None:
+    last = rise.shape[1] - 1
+    for n in range(position.shape[0]):
+        for i in range(position.shape[1]):
+            for side in range(2):
+                inside = position[n, i] if side == 0 else length - position[n, i]
+                if crossed[i, side] and inside < last * step:
+                    place = max(inside, 0.0) / step
+                    cell = min(int(place), last - 1)
+                    share = place - cell
+                    height = (1.0 - share) * rise[side, cell] + share * rise[side, cell + 1]
+                    values[n, i] += load[i] * height
+
+
 class Traffic:
     """All trains of a run.
 
@@ -86,7 +110,7 @@ class Traffic:
         self._profile: Profile | None = None
         self._reach = 0.0
         self._zone: Array = np.zeros(0)
-        self._rise: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
+        self._rise: Array = np.zeros((2, 0))
         self._crossed: dict[tuple[int, int], tuple[bool, bool]] = {}
         for train in scenario.train:
             self.add(train)
@@ -219,23 +243,21 @@ class Traffic:
             value = compliance(place)
             value[0] = 0.0
             sides.append(fade * (value[-1] - value))
-        self._rise = (sides[0], sides[1])
+        self._rise = np.array(sides)
 
-    def _end_surface(self, running: Running, axle: int, position: Array) -> Array | float:
-        """(n,) m: what :meth:`lay_ends` adds under a wheelset at ``position`` (m)."""
-        zone = self._zone[-1]
-        if zone <= position.min() and position.max() <= self.length - zone:
-            return 0.0
-        wheelset = running.train, running.axles.start + axle
-        if wheelset not in self._crossed:
-            self._crossed[wheelset] = self._ends_crossed(running, wheelset[1])
-        surface = np.zeros_like(position)
-        left, right = self._crossed[wheelset]
-        if left:
-            surface += np.interp(position, self._zone, self._rise[0])
-        if right:
-            surface += np.interp(self.length - position, self._zone, self._rise[1])
-        return surface * float(running.unit.static_loads[axle])
+    def _lay_surface(self, units: Sequence[Running], position: Array, values: Array) -> None:
+        """Add to ``values`` (n, A) what :meth:`lay_ends` lays under wheelsets at ``position``."""
+        crossed = []
+        for running in units:
+            for axle in range(running.axles.start, running.axles.stop):
+                wheelset = running.train, axle
+                if wheelset not in self._crossed:
+                    self._crossed[wheelset] = self._ends_crossed(running, axle)
+                crossed.append(self._crossed[wheelset])
+        if crossed:
+            load = np.concatenate([running.unit.static_loads for running in units])
+            step, crossings = float(self._zone[1]), np.array(crossed, dtype=np.bool_)
+            _add_ends(position, crossings, load, step, self._rise, self.length, values)
 
     def _ends_crossed(self, running: Running, axle: int) -> tuple[bool, bool]:
         motion, end_time = self.motions[running.train], self.scenario.solution.end_time
@@ -281,17 +303,20 @@ class Traffic:
                 self.scenario.irregularity, -self._reach, self.length + self._reach, self.length
             )
         values = self._profile(position)
+        if self._zone.size and self.scenario.line.ends == "pinned":
+            self._lay_surface(units, position, values)
         column = 0
         for running in units:
             motion = self.motions[running.train]
             train = motion.train
+            if not train.flat and not train.polygon:
+                column += len(running.unit.wheelsets)
+                continue
             for axle in range(len(running.unit.wheelsets)):
                 number = running.axles.start + axle + 1
                 flats = [flat.length for flat in train.flat if flat.wheelset == number]
                 waves = [wave for wave in train.polygon if wave.wheelset == number]
                 radius = float(running.unit.wheel_radius[axle])
-                if self._zone.size and self.scenario.line.ends == "pinned":
-                    values[:, column] += self._end_surface(running, axle, position[:, column])
                 for length in flats:
                     values[:, column] += wheel_defect(
                         motion.travelled(time), radius, length, 1, 0.0
