@@ -36,16 +36,18 @@ BLOCK = 800
 BAND = 2000.0
 """Errors of force and acceleration are taken below this frequency (Hz)."""
 
-# Work of the stepping kernel per step, counted in its loops (solver/modal.py), in words of 8 bytes;
-# all but the modes themselves and their factors is in single precision.
-# Wheelset on the line and mode: 8 coefficients read, the shape's 2 parts written and read three
-# times, twice with a quarter of 4 load values, once with a quarter of 2 predicted ones.
-WORDS_PER_WHEELSET_AND_MODE = 9.25
+# Least work of the stepping kernel per step (solver/modal.py): what it must move at least once, if
+# all that it reads again stayed in the first-level cache, and all its arithmetic.
+# Wheelset on the line and mode: 8 coefficients and 2 kept values of the shape read, 2 written, all
+# single precision; shape 12 flops, guessed load, displacement and load 4 each.
+BYTES_PER_WHEELSET_AND_MODE = 48
 FLOPS_PER_WHEELSET_AND_MODE = 24
-# Mode: clear 2, step 9, copy 3, prediction 9; channel outputs 1.25 each.
-WORDS_PER_MODE = 23
+# Mode: 8 factors read, 2 values of the state read and written, double; 2 loads read and written, 2
+# values for the channels written and read, single; step 16 flops, prediction 16. Weights of a
+# channel: 2, single, for four samples at a time.
+BYTES_PER_MODE = 128
 FLOPS_PER_MODE = 32
-WORDS_PER_CHANNEL_AND_MODE = 1.25
+BYTES_PER_CHANNEL_AND_MODE = 2
 FLOPS_PER_CHANNEL_AND_MODE = 4
 
 
@@ -189,28 +191,28 @@ def _run(case: Case, keep: bool) -> tuple[Result, _Signals | None]:
 def least_time(modes: int, wheelsets: float, channels: int) -> float:
     """Time (s) of one step if memory or arithmetic ran at the rate this machine attains.
 
-    Both rates are measured here, in a kernel of nothing but loads and multiply-adds: over a
-    working set of the step's size, and over one that stays in the first-level cache. The slower
-    of the two bounds.
+    Both rates are measured here, in a kernel of nothing but loads and multiply-adds in single
+    precision: over a working set of the step's size, and over one that stays in the first-level
+    cache. The slower of the two bounds.
     """
-    words = modes * (
-        WORDS_PER_MODE
-        + channels * WORDS_PER_CHANNEL_AND_MODE
-        + wheelsets * WORDS_PER_WHEELSET_AND_MODE
+    size = modes * (
+        BYTES_PER_MODE
+        + channels * BYTES_PER_CHANNEL_AND_MODE
+        + wheelsets * BYTES_PER_WHEELSET_AND_MODE
     )
     flops = modes * (
         FLOPS_PER_MODE
         + channels * FLOPS_PER_CHANNEL_AND_MODE
         + wheelsets * FLOPS_PER_WHEELSET_AND_MODE
     )
-    large, small = max(int(words) // 2, 1024), 512
-    per_word = min(_product_time(large) for _ in range(3)) / (2 * large)
+    large, small = max(int(size) // 8, 1024), 1024
+    per_byte = min(_product_time(large) for _ in range(3)) / (8 * large)
     per_flop = min(_product_time(small) for _ in range(3)) / (2 * small)
-    return max(words * per_word, flops * per_flop)
+    return max(size * per_byte, flops * per_flop)
 
 
 def _product_time(size: int) -> float:
-    a, b = np.full(size, 1.0), np.full(size, 1e-9)
+    a, b = np.full(size, 1.0, np.float32), np.full(size, 1e-9, np.float32)
     repeats = 200_000_000 // size
     _products(a, b, 1)
     start = time.process_time()
@@ -222,11 +224,11 @@ def _product_time(size: int) -> float:
 def _products(a, b, repeats):  # type: ignore[no-untyped-def]
     total = 0.0
     for r in range(repeats):
-        part = 0.0
+        part = a.dtype.type(0)
         for i in range(a.size):
             part += a[i] * b[i]
         total += part
-        b[r % b.size] += 1e-12
+        b[r % b.size] += a.dtype.type(1e-12)
     return total
 
 
