@@ -3,6 +3,7 @@
 from .check import check_run
 from .errors import InputError, SolverError
 from .motion import TrainMotion
+from .proofs import Proof, ensemble_proofs, hybrid_proofs, line_proofs
 from .quality import QualityReport
 from .scenario import (
     GRAVITY,
@@ -26,6 +27,7 @@ __all__ = [
     "GRAVITY",
     "Block",
     "InputError",
+    "Proof",
     "QualityReport",
     "Scenario",
     "Sensor",
@@ -36,7 +38,10 @@ __all__ = [
     "build_scenario",
     "check_run",
     "compare_models",
+    "ensemble_proofs",
     "ensemble_study",
+    "hybrid_proofs",
+    "line_proofs",
     "load_scenario",
     "load_scenario_text",
     "pinned_pinned_frequency",

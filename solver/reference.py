@@ -365,7 +365,7 @@ def _integral(h: float, derivative: int) -> Array:
     return total
 
 
-def _vehicles(train: Train) -> tuple[Array, Array, Array, Array, Indices]:
+def vehicle_matrices(train: Train) -> tuple[Array, Array, Array, Array, Indices]:
     """Mass, damping, stiffness, weight and wheelset coordinates of a train, front first."""
     masses: list[float] = []
     weight: list[float] = []
@@ -432,7 +432,7 @@ def reference_run(scenario: Scenario, step: float) -> Histories:
     if parts is not None:
         waves = np.array([parts.wavenumber, parts.amplitude, parts.phase])
     line, train = ReferenceLine(scenario), scenario.train[0]
-    mass, damping, stiffness, weight, wheels = _vehicles(train)
+    mass, damping, stiffness, weight, wheels = vehicle_matrices(train)
     sign = 1.0 if train.direction == "forward" else -1.0
     samples = round(solution.end_time / step) + 1
     time: Array = np.arange(samples, dtype=np.float64) * step

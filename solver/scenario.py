@@ -521,7 +521,7 @@ class Solution(Section):
     sines: tuple[int, int, int, int] | None = Field(
         default=None,
         description="hierarchical functions per element of rail, slab, support layer, bridge; "
-        "unset: chosen from the frequency limit",
+        "unset: chosen from the frequency limit; only with an Euler-Bernoulli rail",
     )
     seed: int = _quantity("-", "hybrid: seed of the local response", ge=0, default=1)
 
@@ -563,6 +563,13 @@ class Scenario(Section):
         if offset is not None and offset > length:
             raise ValueError(
                 f"track.fastening.first_offset = {offset} m lies beyond the line of {length:g} m"
+            )
+        if self.solution.sines is not None and self.track.rail.theory == "timoshenko":
+            raise ValueError(
+                f"solution.sines = {list(self.solution.sines)} with track.rail.theory = "
+                '"timoshenko": such a rail has a kink at every fastening, which sines over whole '
+                "spans do not have, however many: leave solution.sines unset (the rail is then "
+                'cut at the fastenings), or set track.rail.theory = "euler_bernoulli"'
             )
         names = [channel.name for channel in self.channel]
         for name in names:

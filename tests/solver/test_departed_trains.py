@@ -21,8 +21,11 @@ WHEEL = {"preset": "wheel_element", "speed": 60.0, "start": 5.0}
 
 
 def scenario(model: str, *trains: dict[str, Any]) -> Scenario:
+    # stated sines go with an Euler-Bernoulli rail only
+    theory = "euler_bernoulli" if model == "newmark" else "timoshenko"
     return build_scenario(
         {
+            "track": {"rail": {"theory": theory}},
             "line": {"approach_left": 5.2, "spans": [5.2], "approach_right": 5.2},
             "train": trains,
             "irregularity": {"spectrum": "sato", "wavelength_min": 0.1},

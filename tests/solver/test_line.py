@@ -176,7 +176,11 @@ def test_bare_span_frequency_and_rayleigh_damping():
         scenario(
             line={"approach_left": 0.0, "spans": [32.0], "approach_right": 0.0},
             track={
-                "rail": {"mass_per_length": 1e-3, "young_modulus": 1e3},
+                "rail": {
+                    "theory": "euler_bernoulli",
+                    "mass_per_length": 1e-3,
+                    "young_modulus": 1e3,
+                },
                 "slab": light,
                 "support_layer": light,
                 "mortar": {"damping": 0.0},

@@ -96,6 +96,10 @@ def test_speed_in_km_per_h_is_metres_per_second() -> None:
         (LINE + "[track.slab]\nthickness = nan\n", ["track.slab.thickness", "nan m", "finite"]),
         (LINE + "[contact]\nlaw = 'rigid'\n", ["contact.law", "rigid", "hertz"]),
         (
+            LINE + "[solution]\nsines = [31, 31, 31, 8]\n",
+            ["solution.sines = [31, 31, 31, 8]", "kink at every fastening", "euler_bernoulli"],
+        ),
+        (
             LINE + CHANNEL + '[[sensor]]\nchannel = "a"\npreset = "rail_500g"\nrate = 3000\nbandwidth = 1000.0\n',
             ["3000 Hz", "40000 Hz", "whole multiple"],
         ),

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from closed_forms import LENGTH, MASS, beam_line, damping_ratios, frequencies, rolling_weight
+from closed_forms import LENGTH, MASS, beam_line, damping_ratios, frequencies
 
 from solver import InputError, Simulation, build_scenario, check_run
 from solver.modal import ModalRun
 from solver.modes import modal_line
+from solver.proofs import rolling_weight
 from solver.traffic import RUN_IN, Traffic
 
 ALL = ("displacement", "velocity", "acceleration")
