@@ -15,7 +15,7 @@ from numba import njit
 
 from .errors import InputError
 from .irregularity import Profile, build_profile
-from .line import assemble
+from .line import LAYER_LIMIT, assemble
 from .local import LocalField, LocalWheel, contact_stiffness, local_wheel, low_pass
 from .modal import ModalRun, modal_run
 from .motion import TrainMotion
@@ -294,7 +294,9 @@ class HybridRun:
     def channel_band(self) -> Real:
         """(C,) valid band of every channel (Hz)."""
         limit = self.scenario.solution.frequency_limit
-        return np.where(self.field.heard, limit, self._run.channel_band)
+        layers = [channel.layer for channel in self.scenario.channel]
+        local = [min(limit, LAYER_LIMIT.get(layer, math.inf)) for layer in layers]
+        return np.where(self.field.heard, local, self._run.channel_band)
 
     @property
     def states(self) -> int:
@@ -375,7 +377,13 @@ class HybridRun:
                 self._columns.append(key)
                 if key not in self._wheels:
                     self._wheels[key] = local_wheel(
-                        profile, self.field.waves, self.field.edges, *key, self._traffic.length
+                        profile,
+                        self.field.cells,
+                        self.field.tables.receptances,
+                        self.field.edges,
+                        self.scenario.track.fastening.spacing,
+                        *key,
+                        self._traffic.length,
                     )
 
     @property
@@ -434,18 +442,19 @@ class HybridRun:
         self._buffer_signal = self._buffer_signal[drop:]
 
     def _local_signal(self, sample: int, count: int) -> Real:
-        hop, parts = self.field.hop, [self._local]
+        hop = self.field.hop
         have = self._local_first + len(self._local)
-        while have < sample + count:
-            middle = (have + 0.5 * hop) * self.field.step
-            places = self._traffic.position(np.array([middle]))[0]
-            on_line = np.flatnonzero((places >= 0) & (places <= self._traffic.length))
-            wheels = [self._wheels[self._columns[i]] for i in on_line]
-            parts.append(self.field.next_frame(wheels, places[on_line]))
-            have += hop
-        joined = np.concatenate(parts)
-        out = joined[sample - self._local_first : sample - self._local_first + count]
-        self._local = joined[sample - self._local_first + count :]
+        if have < sample + count:
+            missing = -(-(sample + count - have) // hop)
+            middle = (have + (np.arange(missing) + 0.5) * hop) * self.field.step
+            frames = []
+            for places in self._traffic.position(middle):
+                on_line = np.flatnonzero((places >= 0) & (places <= self._traffic.length))
+                wheels = [self._wheels[self._columns[i]] for i in on_line]
+                frames.append((wheels, places[on_line]))
+            self._local = np.concatenate([self._local, self.field.next_frames(frames)])
+        out = self._local[sample - self._local_first : sample - self._local_first + count]
+        self._local = self._local[sample - self._local_first + count :]
         self._local_first = sample + count
         return out
 

@@ -3,9 +3,11 @@
 - Wheel force: F = -r/(alpha_w + 1/k_H + alpha_r) with the direct-field receptance alpha_r of the
   rail on its fastenings (mean over a bay), alpha_w = -1/(m_w omega^2), k_H the contact stiffness,
   tangential at the static load: the blocked-force and direct-forcing terms of Eqs. (5), (6), (11).
-- Power into the rail: P = <F^2> Re Y per band and wheel, half to either side.
+- Power into the rail: P = <F^2> Re Y per cell of frequency and wheel, half to either side.
 - Energies: Eq. (12) in time over chains of one-bay segments of rail, slab and support layer.
-- Signal: noise of the band whose mean square is the energy's, v^2 = E/M, a^2 = omega^2 v^2.
+- What a sensor shows of these energies: what it shows of the direct field of a wheel at the same
+  distance, exact for the coupled periodic track, over the energy of the direct field there.
+- Signal: noise of the cells whose mean square is the energies', a^2 = omega^2 v^2.
 
 With complex modes as the global set the local set is orthogonal to it, so that Eq. (13), power
 from the global motion, is zero; all power comes from the wheels.
@@ -16,51 +18,71 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 import scipy.sparse as sp
 import scipy.sparse.linalg
+from numba import njit
 from numpy.typing import NDArray
 
+from .cache import cached
 from .contact import wheelset_law
 from .irregularity import Profile
-from .scenario import Channel, Contact, Scenario, Track
+from .scenario import Bed, Channel, Contact, Scenario, Track
 from .sea import Chain, PowerBalance, bed_conductance, chain_balance
-from .waves import BlochSolution, Complex, PeriodicRail, Real, WaveBeam, plate_beam
+from .waves import (
+    BlochSolution,
+    Complex,
+    LayeredTrack,
+    PeriodicRail,
+    Real,
+    WaveBeam,
+    plate_beam,
+)
+
+LOCAL_FORMAT = 1
+"""Of the stored tables; higher after every change of what they hold."""
 
 BANDS_PER_OCTAVE = 6
 
-POINTS_PER_BAND = 60
-"""Frequencies per band over which wave properties are averaged: every 10 Hz at 5 kHz."""
-
-DECAY_CLASS = 1.25
-"""Frequencies of a band whose decays differ by more than this factor keep separate balances.
-
-Near the higher pinned-pinned frequencies the rail's decay falls and its motion gathers in
-mid-bay: one mean decay for such a band errs by up to 8 dB at 10 m.
-"""
+POINTS_PER_CELL = 12
+"""Frequencies over which a cell's wave properties are averaged: every 6.5 Hz. The narrowest
+feature, the foot of a pinned-pinned stop band, is some 30 Hz wide."""
 
 BAND_MARGIN = 1.15
 """Highest local frequency per frequency limit: as far as the fe model keeps its modes."""
 
-REFERENCE_DISTANCE = 5.0
-"""Distance (m) at which the mean decay of a band is exact."""
-
 FRAME_TIME = 6.4e-3
-"""Time (s) of one step of the power balance, about; the wheel moves half a metre at 300 km/h."""
+"""Time (s) of one step of the power balance, about; the wheel moves half a metre at 300 km/h.
+Frames of noise are twice as long, and a cell is one line of their spectrum, 78 Hz."""
 
 TAIL = 5e-3
 """Part of the steady response to a wheel's power that may be moved to the last lag."""
 
-MOST_LAGS = 8
+LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+"""Frames that part the groups of past powers; a group acts from the wheel's place in its middle."""
 
-GRID = 0.2
-"""Distance (m) of the points at which the power of a wheel is tabled."""
+LIFETIME = 0.05
+"""Age (s) at which the direct field of a wheel is forgotten.
 
-NEAR_BAYS = 2.5
-"""Bays on either side of a wheel where the rail's exact direct field replaces the far field."""
+At the pinned-pinned frequencies above the first the rail's wave neither moves nor decays, and
+without a limit of age the mean square over frequency diverges like a logarithm. Wheels that come
+past scatter such a wave; this is not modelled, and 25 or 100 ms instead change the third octaves
+that hold these frequencies, 2.5 and 4 kHz, by -3 or +2.4 dB 15 m from the wheel and by less than
+0.5 dB beside it. Other bands do not depend on it.
+"""
+
+PLACES_PER_BAY = 4
+"""Places of a wheel at which the response of the channels is tabled."""
+
+RING = 512
+"""Bays after which the periodic track of the direct field repeats: some 330 m."""
+
+UNDAMPED_RING = 2048
+"""The same above the rail's second cut-on, where a wave decays by 0.02 dB/m only."""
 
 
 def band_edges(crossover: float, limit: float) -> Real:
@@ -106,130 +128,130 @@ def _full_size(profile: Profile) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Groups of frequencies that share one power balance.
+    """Narrow bands of the local set, the lines of a frame's spectrum.
 
     Attributes:
-        omega: (F,) all frequencies (rad/s), POINTS_PER_BAND in each band.
-        of: (F,) cell of each. band: (N,) band of each cell.
-        centre: (N,) mean frequency of each cell (rad/s).
+        line: (N,) number of each line. low, high: (N,) rad/s.
+        band: (N,) band that holds the centre.
+        omega: (F,) POINTS_PER_CELL frequencies in each cell (rad/s).
     """
 
-    omega: Real
-    of: NDArray[np.intp]
+    line: NDArray[np.intp]
+    low: Real
+    high: Real
     band: NDArray[np.intp]
-    centre: Real
+    omega: Real
 
     @classmethod
-    def split(cls, edges: Real, decay: Real) -> Cells:
-        """Part every band by decay.
+    def between(cls, edges: Real, spacing: float) -> Cells:
+        """Cells from the first edge to the last (Hz), ``spacing`` Hz wide."""
+        first, last = round(edges[0] / spacing), round(edges[-1] / spacing)
+        line = np.arange(first, last + 1)
+        low = np.maximum((line - 0.5) * spacing, edges[0])
+        high = np.minimum((line + 0.5) * spacing, edges[-1])
+        line, low, high = (part[high - low > 1e-6 * spacing] for part in (line, low, high))
+        inside = (np.arange(POINTS_PER_CELL) + 0.5) / POINTS_PER_CELL
+        points = low[:, None] + (high - low)[:, None] * inside
+        band = np.clip(np.searchsorted(edges, (low + high) / 2) - 1, 0, len(edges) - 2)
+        two_pi = 2 * np.pi
+        return cls(line, two_pi * low, two_pi * high, band, two_pi * points.ravel())
 
-        Args:
-            edges: (B + 1,) Hz. decay: (F,) 1/m at :func:`band_frequencies`.
-        """
-        omega = band_frequencies(edges)
-        cell = np.empty(omega.size, dtype=np.intp)
-        band: list[int] = []
-        for b, part in enumerate(np.split(np.arange(omega.size), len(edges) - 1)):
-            step = np.floor(
-                np.log(decay[part] / np.median(decay[part])) / math.log(DECAY_CLASS) + 0.5
-            )
-            for value in np.unique(step):
-                cell[part[step == value]] = len(band)
-                band.append(b)
-        count = np.bincount(cell)
-        return cls(omega, cell, np.array(band, dtype=np.intp), np.bincount(cell, omega) / count)
+    @property
+    def centre(self) -> Real:
+        """(N,) rad/s."""
+        return (self.low + self.high) / 2
 
-    def sum(self, values: Real) -> Real:
-        """Sum over the frequencies of each cell, (F,) to (N,)."""
-        return np.bincount(self.of, values, len(self.band)).astype(np.float64)
+    def mean(self, values: Real) -> Real:
+        """Mean over the frequencies of each cell: (F, ...) to (N, ...)."""
+        parted = values.reshape(len(self.line), POINTS_PER_CELL, *values.shape[1:])
+        return np.asarray(parted.mean(axis=1))
 
-    def band_mean(self, values: Real) -> Real:
-        """Mean over the band of each cell, (F,) to (N,)."""
-        return np.asarray(values.reshape(-1, POINTS_PER_BAND).mean(axis=1)[self.band])
+    def smoothed(self, values: Complex, width: float) -> Complex:
+        """Mean over ``width`` (rad/s) about every frequency, (..., F)."""
+        total = np.concatenate((np.zeros_like(values[..., :1]), np.cumsum(values, axis=-1)), -1)
+        count = len(self.omega)
+        first = np.searchsorted(self.omega, self.omega - width / 2)
+        after = np.searchsorted(self.omega, self.omega + width / 2)
+        reach = np.minimum(np.arange(count) - first, after - 1 - np.arange(count))
+        low, high = np.arange(count) - reach, np.arange(count) + reach + 1
+        return np.asarray((total[..., high] - total[..., low]) / (high - low))
 
 
-def band_frequencies(edges: Real) -> Real:
-    """Angular frequencies (rad/s) over which wave properties are averaged, (F,)."""
-    inside = (np.arange(POINTS_PER_BAND) + 0.5) / POINTS_PER_BAND
-    ratio = (edges[1:] / edges[:-1])[:, None]
-    return np.asarray((2 * np.pi * edges[:-1, None] * ratio**inside).ravel())
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """One of the rail's travelling waves, means over the frequencies of the cells.
+
+    Attributes:
+        mobility: (N,) part of the mean Re Y over a bay that it carries away, m/(N*s).
+        decay: (N,) energy decay (1/m). velocity: (N,) of energy (m/s).
+        transverse: (N,) part of its kinetic energy that is not rotation.
+    """
+
+    mobility: Real
+    decay: Real
+    velocity: Real
+    transverse: Real
 
 
 @dataclass(frozen=True, eq=False)
 class RailWaves:
     """The rail's waves, for one state of the fastenings.
 
-    Means over a cell are those of a wheel's power: weights Re Y/|alpha_r + 1/k_H|^2, so that a
-    sharp resonance between the fastenings counts as it radiates.
-
     Attributes:
-        solution: Bloch waves at the frequencies of the cells.
-        cells: groups of frequencies.
+        cells: of frequency.
         receptances: (X, F) driving-point receptances over a bay (m/N).
-        weights: (F,) of travelling energy, sum 1 in each cell.
-        share: (F,) part of a wheel's power that travels away.
-        decay: (N,) energy decay (1/m). velocity: (N,) energy velocity (m/s).
+        main, second: the waves; the second one travels above sqrt(kGA/rho I) only.
         to_slab: (N,) part of the power into the rail that its fastenings hand to the slab.
     """
 
-    solution: BlochSolution
     cells: Cells
     receptances: Complex
-    weights: Real
-    share: Real
-    decay: Real
-    velocity: Real
+    main: Branch
+    second: Branch
     to_slab: Real
 
     @classmethod
-    def of(
-        cls,
-        periodic: PeriodicRail,
-        edges: Real,
-        stiffness: float,
-        slab: WaveBeam,
-        cells: Cells | None = None,
-    ) -> RailWaves:
-        """Waves of a rail in bands of the given edges (Hz).
-
-        Args:
-            periodic: the rail.
-            edges: (B + 1,) Hz.
-            stiffness: of the contact of a wheelset (N/m), for the weights.
-            slab: beam below the fastenings.
-            cells: groups of frequencies; unset: made from this rail's decay.
-        """
-        omega = band_frequencies(edges)
+    def of(cls, periodic: PeriodicRail, cells: Cells, slab: WaveBeam) -> RailWaves:
+        """Waves of a rail on fastenings whose beam below is ``slab``."""
+        omega = cells.omega
         solution = periodic.solve(omega)
-        waves = solution.travelling()
-        cells = cells or Cells.split(edges, waves.decay)
         loads = periodic.load_positions(12)
         points = np.stack([solution.receptance(x, x) for x in loads])
-        radiated = (1j * omega * points).real / np.abs(points + 1 / stiffness) ** 2
-        power = radiated.mean(axis=0) * waves.share
-        energy = power / waves.energy_velocity
-        weights = energy / cells.sum(energy)[cells.of]
-        left = cells.sum(weights * np.exp(-waves.decay * REFERENCE_DISTANCE))
+        radiated = (1j * omega * points).real
+        beam = periodic.beam
+        travels = np.zeros(len(omega), dtype=bool)
+        if beam.rotary_inertia > 0:
+            travels = omega > math.sqrt(beam.shear_stiffness / beam.rotary_inertia)
+        branches = []
+        for second in (False, True):
+            wave = solution.travelling(second)
+            there = wave.energy_velocity > 0
+            if second:
+                there &= travels
+            count = np.maximum(cells.mean(there.astype(np.float64)), 1e-300)
+            taken, decay, velocity, transverse = (
+                cells.mean(np.where(there, part, 0.0))
+                for part in (
+                    radiated.mean(axis=0) * wave.share,
+                    wave.decay,
+                    wave.energy_velocity,
+                    wave.transverse,
+                )
+            )
+            branches.append(
+                Branch(
+                    taken,
+                    decay / count,
+                    np.where(taken > 0, velocity / count, 1.0),
+                    transverse / count,
+                )
+            )
         chosen = slice(1, None, 4)
         share = sum(
             _slab_share(solution, slab, float(x)) * part
             for x, part in zip(loads[chosen], radiated[chosen], strict=True)
         ) / radiated[chosen].sum(axis=0)
-        return cls(
-            solution,
-            cells,
-            points,
-            weights,
-            waves.share,
-            -np.log(left) / REFERENCE_DISTANCE,
-            cells.sum(power) / cells.sum(energy),
-            cells.sum(power * share) / cells.sum(power),
-        )
-
-    @property
-    def periodic(self) -> PeriodicRail:
-        """The rail on its fastenings."""
-        return self.solution.rail
+        return cls(cells, points, branches[0], branches[1], cells.mean(share))
 
 
 def _slab_share(solution: BlochSolution, slab: WaveBeam, load: float) -> Real:
@@ -250,15 +272,13 @@ class LocalWheel:
     """Local force of one wheelset of a train, as a table over its place on the line.
 
     Attributes:
-        force: F(x) (N). square: (N, n) mean square of the cells' bands (N^2), at ``grid``.
-        grid: (n,) m.
-        power: (N, n) W, power into the rail per cell, <F^2> Re Y.
+        force: F(x) (N). square: (n, N) mean square of the cells (N^2) at ``k step`` (m).
+        step: m.
     """
 
     force: Profile
-    grid: Real
     square: Real
-    power: Real
+    step: float
 
 
 def contact_stiffness(contact: Contact, radius: float, load: float) -> float:
@@ -271,20 +291,26 @@ def contact_stiffness(contact: Contact, radius: float, load: float) -> float:
 
 def local_wheel(
     profile: Profile,
-    waves: RailWaves,
+    cells: Cells,
+    receptances: Complex,
     edges: Real,
+    spacing: float,
     speed: float,
     forward: bool,
     mass: float,
     stiffness: float,
     length: float,
 ) -> LocalWheel:
-    """Force and power of a wheelset that runs over an irregularity at constant speed.
+    """Force of a wheelset that runs over an irregularity at constant speed.
+
+    A wheel stays spacing/speed in a bay and does not resolve the rail's receptance any finer than
+    speed/spacing in frequency.
 
     Args:
         profile: irregularity (m), all wavelengths.
-        waves: of the rail.
+        cells: of frequency. receptances: (X, F) of the rail over a bay (m/N).
         edges: (B + 1,) of the bands (Hz).
+        spacing: of the fastenings (m).
         speed: m/s. forward: towards increasing x.
         mass: of the wheelset (kg). stiffness: of its contact (N/m).
         length: of the line (m).
@@ -293,9 +319,9 @@ def local_wheel(
     lower = 2 * np.pi * edges[0] / speed
     rest = np.cos(0.5 * np.pi * np.clip((1.03 * lower - k) / (0.06 * lower), 0, 1)) ** 2
     omega = k * speed
-    cells = waves.cells
     series = cells.omega
-    gain = 1 / (waves.receptances + 1 / stiffness - 1 / (mass * series**2))
+    felt = cells.smoothed(receptances, 2 * np.pi * speed / spacing)
+    gain = 1 / (felt + 1 / stiffness - 1 / (mass * series**2))
     rms = np.sqrt(np.mean(np.abs(gain) ** 2, axis=0))
     mean = gain.mean(axis=0)
     response = -np.interp(omega, series, rms) * np.exp(
@@ -308,97 +334,106 @@ def local_wheel(
     stride = max(1, int(speed / edges[-1] / 8 / profile.step))
     table = _sampled(profile, force, k, stride)
 
-    weight = np.abs(gain) ** 2
-    radiated = (weight * (1j * series * waves.receptances).real).mean(axis=0)
-    conductance = (
-        cells.sum(radiated * waves.share) / POINTS_PER_BAND / cells.band_mean(weight.mean(axis=0))
-    )
-
-    window = waves.periodic.spacing * 2
-    grid = np.arange(0.0, length + GRID, GRID)
-    square = np.empty((len(edges) - 1, len(grid)))
+    step = spacing / PLACES_PER_BAY
+    grid = np.arange(math.ceil(length / step) + 1) * step
     x = profile.start + profile.step * np.arange(len(profile.value))
-    kernel = np.exp(-0.5 * (k * window / 4) ** 2)
+    kernel = np.exp(-0.5 * (k * spacing / 2) ** 2)
     size = _full_size(profile)
+    total = np.concatenate(([0.0], np.cumsum(np.abs(force) ** 2)))
+    power = total[np.searchsorted(omega, cells.high)] - total[np.searchsorted(omega, cells.low)]
+    square = np.zeros((len(grid), len(cells.line)))
     for band, (low, high) in enumerate(itertools.pairwise(edges)):
         chosen = (omega >= 2 * np.pi * low) & (omega < 2 * np.pi * high)
         part = np.fft.irfft(np.where(chosen, force, 0), size)
         smooth = np.fft.irfft(np.fft.rfft(part**2) * kernel, size)
-        square[band] = np.interp(grid, x, smooth[: len(x)])
-    square = np.maximum(square, 0.0)[cells.band]
-    return LocalWheel(table, grid, square, square * conductance[:, None])
+        own = cells.band == band
+        share = power[own] / max(power[own].sum(), 1e-300)
+        local = np.interp(grid, x, smooth[: len(x)])
+        square[:, own] = np.maximum(local, 0.0)[:, None] * share
+    return LocalWheel(table, square, step)
 
 
-class LocalField:
-    """Energies and signals of the local set on a line, listened to at the channels.
-
-    Args:
-        scenario: line, track, channels, seed.
-        crossover: lowest frequency of the local set (Hz).
-        derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+@dataclass(frozen=True, eq=False)
+class LocalTables:
+    """What a run needs of a line's local set.
 
     Attributes:
-        edges: (B + 1,) of the bands (Hz).
-        hop: samples per step of the power balance.
-        waves: of the rail.
-        heard: (C,) whether a channel has a local part.
-        segments: number of segments of each layer.
+        receptances: (X, F) of the rail over a bay (m/N).
+        response: (lags, P, N, C) mean square of the velocity (or rate of strain or force) of the
+            heard channels per mean square force of a wheel at P places, by group of past frames.
+        first: (lags,) lowest cell in which a group of past frames still counts.
     """
 
-    def __init__(self, scenario: Scenario, crossover: float, derivatives: tuple[int, ...]) -> None:
-        solution = scenario.solution
-        self.scenario = scenario
-        self.step: float = solution.step_ns * 1e-9
-        self.edges = band_edges(crossover, BAND_MARGIN * solution.frequency_limit)
-        self.hop = max(32, 2 ** round(math.log2(FRAME_TIME / self.step)))
-        self.derivatives = derivatives
+    receptances: Complex
+    response: NDArray[np.float32]
+    first: NDArray[np.intp]
+
+
+class LocalLine:
+    """Energies of the local set on a line, and what its channels show of them.
+
+    Args:
+        scenario: line, track, channels.
+        crossover: lowest frequency of the local set (Hz).
+        frame: time step of the power balance (s).
+
+    Attributes:
+        edges: (B + 1,) of the bands (Hz). cells: of frequency.
+        segments: number of segments of each layer.
+        places: (P,) places of a wheel (m).
+        waves: of the rail on its usual fastenings.
+    """
+
+    def __init__(self, scenario: Scenario, crossover: float, frame: float) -> None:
+        self.scenario, self.frame = scenario, frame
+        self.edges, self.cells = local_cells(scenario, crossover, frame)
         self._segment, self.segments = _segments(scenario)
-        self._centres = ((np.arange(self.segments) + 0.5) * self._segment).astype(np.float64)
+        self._centres: Real = np.linspace(0.5, self.segments - 0.5, self.segments) * self._segment
         self._states = _fastening_states(scenario, self._centres)
-        common = max(set(self._states), key=self._states.count)
-        self.waves = self._solve(common, None)
-        self._waves = {common: self.waves}
-        for state in sorted(set(self._states) - {common}):
-            self._waves[state] = self._solve(state, self.waves.cells)
-        self._decay = np.array([self._waves[state].decay for state in self._states])  # (S, N)
-        self._speed = np.array([self._waves[state].velocity for state in self._states])
-        self.heard = np.array([_is_heard(channel) for channel in scenario.channel], dtype=bool)
-        channels = [c for c in scenario.channel if _is_heard(c)]
+        self._common = max(set(self._states), key=self._states.count)
+        slab = _slab_beam(scenario.track)
+        self._waves = {
+            state: RailWaves.of(PeriodicRail.of_track(scenario.track, *state), self.cells, slab)
+            for state in sorted(set(self._states))
+        }
+        self.waves = self._waves[self._common]
+        self._channels = [c for c in scenario.channel if is_heard(c)]
         self._mortar: dict[tuple[int, float], float] = {}
-        self._near = [self._near_field(c) for c in channels]
-        self._kernels = self._listen(channels)  # (lags, 2S, N, C)
-        self._scale = np.array([self._factor(c) for c in channels]).reshape(len(channels), -1)
-        seeds = np.random.SeedSequence(solution.seed).spawn(len(channels))
-        self._random = [np.random.default_rng(seed) for seed in seeds]
-        self._past: deque[tuple[NDArray[np.intp], Real]] = deque(maxlen=MOST_LAGS)
-        frequency = np.fft.rfftfreq(2 * self.hop, self.step).astype(np.float64)
-        self._spread = _bin_shares(self.waves, frequency)  # (N, bins)
-        self._omega = 2 * np.pi * np.maximum(frequency, 1.0)
-        self._window = np.sin(np.pi * (np.arange(2 * self.hop) + 0.5) / (2 * self.hop))
-        self._overlap = np.zeros((self.hop, len(derivatives), len(channels)))
-        self._quiet = 0
+        step = scenario.track.fastening.spacing / PLACES_PER_BAY
+        count = math.ceil(scenario.line.length / step)
+        self.places: Real = np.linspace(0.0, count * step, count + 1)
 
-    def _solve(self, state: tuple[float, float], cells: Cells | None) -> RailWaves:
-        return RailWaves.of(
-            PeriodicRail.of_track(self.scenario.track, *state),
-            self.edges,
-            2 * self.scenario.contact.stiffness,
-            _slab_beam(self.scenario.track),
-            cells,
-        )
+    def tables(self) -> LocalTables:
+        """What a run needs: energy of the line at every lag times what a channel shows of it."""
+        groups, cells = len(LAGS) - 1, len(self.cells.line)
+        shape = (groups, len(self.places), cells, len(self._channels))
+        response = np.zeros(shape, dtype=np.float32)
+        if self._channels:
+            shown = self._shown()
+            second = self.waves.second.mobility > 0
+            for cell in range(cells):
+                lags, steady = self._energy(cell, self.balance, self.waves.main)
+                if second[cell]:
+                    more, more_steady = self._energy(cell, self.second_balance, self.waves.second)
+                    lags, steady = lags + more, steady + more_steady
+                response[:, :, cell] = lags * (shown[:, cell] / np.maximum(steady, 1e-300))
+        counts = np.any(response, axis=(1, 3))
+        first = np.where(np.any(counts, axis=1), np.argmax(counts, axis=1), cells)
+        return LocalTables(self.waves.receptances, response, first)
 
-    @property
-    def frame(self) -> float:
-        """Time step of the power balance (s)."""
-        return float(self.hop * self.step)
+    def balance(self, cell: int, *, uniform: bool = False) -> PowerBalance:
+        """The power balance of one cell: rail, slab, support layer, either direction.
 
-    def balance(self, cell: int) -> PowerBalance:
-        """The power balance of one cell: rail, slab, support layer, either direction."""
-        omega = float(self.waves.cells.centre[cell])
+        Args:
+            cell: its number.
+            uniform: fastenings alike everywhere, and ends that let energy out.
+        """
+        omega = float(self.cells.centre[cell])
         track = self.scenario.track
         mortar = track.mortar
-        chains = [Chain(self._speed[:, cell], self._decay[:, cell], self._segment)]
-        links = []
+        states = [self._common] * self.segments if uniform else self._states
+        rail = np.array([self._waves[state].main.decay[cell] for state in states])
+        speed = np.array([self._waves[state].main.velocity[cell] for state in states])
         on_bridge = np.zeros(self.segments, dtype=bool)
         for left, right in self.scenario.line.span_bounds:
             on_bridge |= (self._centres >= left) & (self._centres <= right)
@@ -409,14 +444,12 @@ class LocalField:
         }
         to_layer = {key: self._mortar_flow(cell, slab, beam) for key, beam in layers.items()}
         # what the rail's decay hands to the slab
-        share = np.array([self._waves[state].to_slab[cell] for state in self._states])
-        given = self._decay[:, cell] * share
-        chains[0] = replace(chains[0], decay=self._decay[:, cell] - given)
-        links.append(given / math.pi)
-        links.append(np.where(on_bridge, to_layer[True], to_layer[False]))
-        speed, decay = _speed_and_decay(slab, omega)
+        given = rail * np.array([self._waves[state].to_slab[cell] for state in states])
+        chains = [Chain(speed, rail - given, self._segment)]
+        links = [given / math.pi, np.where(on_bridge, to_layer[True], to_layer[False])]
+        plate, decay = _speed_and_decay(slab, omega)
         chains.append(
-            Chain(np.full(self.segments, speed), np.full(self.segments, decay), self._segment)
+            Chain(np.full(self.segments, plate), np.full(self.segments, decay), self._segment)
         )
         values = {key: _speed_and_decay(beam, omega) for key, beam in layers.items()}
         chains.append(
@@ -426,11 +459,21 @@ class LocalField:
                 self._segment,
             )
         )
-        return chain_balance(omega, chains, links)
+        return chain_balance(omega, chains, links, open_ends=uniform)
+
+    def second_balance(self, cell: int, *, uniform: bool = False) -> PowerBalance:
+        """The power balance of the rail's second wave, which hardly moves the slab."""
+        states = [self._common] * self.segments if uniform else self._states
+        chain = Chain(
+            np.array([self._waves[state].second.velocity[cell] for state in states]),
+            np.array([self._waves[state].second.decay[cell] for state in states]),
+            self._segment,
+        )
+        return chain_balance(float(self.cells.centre[cell]), [chain], [], open_ends=uniform)
 
     def _mortar_flow(self, cell: int, slab: WaveBeam, layer: WaveBeam) -> float:
         """Conductance from slab to support layer (1/m), in the middle of the cell's band."""
-        band = int(self.waves.cells.band[cell])
+        band = int(self.cells.band[cell])
         key = band, layer.support_stiffness
         if key not in self._mortar:
             omega = 2 * math.pi * math.sqrt(self.edges[band] * self.edges[band + 1])
@@ -439,203 +482,299 @@ class LocalField:
             self._mortar[key] = bed_conductance(omega, slab, layer, stiffness)
         return self._mortar[key]
 
-    def _listen(self, channels: list[Channel]) -> Real:
-        """Mean square velocity at the channels per power into the rail's segments, by lag.
+    def _energy(
+        self, cell: int, balance: Callable[..., PowerBalance], wave: Branch
+    ) -> tuple[Real, Real]:
+        """Energy of translation per metre at the channels per mean square force, J/(m*N^2).
 
         The balance is stepped by implicit Euler, which keeps energies positive and closes
         (E' - E)/frame = P - A E' exactly; z' = (1 + frame A)^-T z from the channel's row gives
-        the weights of the powers of past frames. Shape (lags, 2S, N, C).
-        """
-        cells, size = len(self.waves.decay), 2 * self.segments
-        kernels = np.zeros((MOST_LAGS, size, cells, len(channels)))
-        if not channels:
-            return kernels
-        patterns = [self._pattern(c) if c.layer == "rail" else np.ones(cells) for c in channels]
-        for cell in range(cells):
-            balance = self.balance(cell)
-            backward = sp.csc_array(balance.matrix.T)
-            rows = np.array([self._row(c, cell, len(balance.loss)) for c in channels])
-            rows *= np.array([pattern[cell] for pattern in patterns])[:, None]
-            left = np.asarray(sp.linalg.splu(backward).solve(rows.T.copy()))
-            enough = TAIL * np.abs(left[:size]).sum()
-            unit = sp.eye_array(len(balance.loss), format="csc")
-            step = sp.linalg.splu(sp.csc_array(unit + backward * self.frame))
-            state = rows.T.copy()
-            for lag in range(MOST_LAGS):
-                state = np.asarray(step.solve(state))
-                weights = state * self.frame
-                left = left - weights
-                kernels[lag, :, cell] = weights[:size]
-                if np.abs(left[:size]).sum() < enough:
-                    break
-            kernels[lag, :, cell] += left[:size]
-        return kernels
+        the weights of the powers of past frames.
 
-    def _row(self, channel: Channel, cell: int, size: int) -> Real:
-        """Mean square velocity (m^2/s^2) at a channel per energy of every subsystem."""
+        Returns:
+            by lag (lags, X, C); steady on the uniform line without ends (X, C).
+        """
+        own, free = balance(cell), balance(cell, uniform=True)
+        size = 2 * self.segments
+        subsystem, weight = self.injection(wave.decay[cell])
+        weight = weight * wave.mobility[cell] / 2
+        rows = np.array([self._row(c, wave.decay[cell], len(own.loss)) for c in self._channels]).T
+        rows[:size] *= wave.transverse[cell]
+        unit = sp.eye_array(len(own.loss), format="csc")
+        forward = sp.csc_array(free.matrix.T + unit / LIFETIME)
+        steady = np.asarray(sp.linalg.splu(forward).solve(rows))[:size]
+        backward = sp.csc_array(own.matrix.T)
+        left = np.asarray(sp.linalg.splu(backward).solve(rows))[:size]
+        enough = TAIL * np.abs(left).sum()
+        step = sp.linalg.splu(sp.csc_array(unit + backward * self.frame))
+        lags = np.zeros((len(LAGS) - 1, size, rows.shape[1]))
+        state = rows
+        for group, (begin, end) in enumerate(itertools.pairwise(LAGS)):
+            for _ in range(begin, end):
+                state = np.asarray(step.solve(state))
+                lags[group] += state[:size] * self.frame
+            left = left - lags[group]
+            if np.abs(left).sum() < enough:
+                break
+        lags[group] += left
+
+        def at_places(values: Real) -> Real:
+            return np.asarray((values[..., subsystem, :] * weight[..., None]).sum(axis=-2))
+
+        return at_places(lags), at_places(steady)
+
+    def injection(self, decay: float) -> tuple[NDArray[np.intp], Real]:
+        """Where a wheel at :attr:`places` feeds the chain of a wave: (X, 2), (X, 2).
+
+        It feeds the next segment centre on either side with what reaches it; the mean over
+        places of the weights is 1 to either side.
+
+        Args:
+            decay: of the wave (1/m).
+        """
+        count = self.segments
+        place = self.places / self._segment - 0.5
+        j = np.floor(place).astype(np.intp)
+        loss = max(decay * self._segment, 1e-12)
+        whole = loss / -np.expm1(-loss)
+        # the ends reflect what would pass them
+        right = np.where(j + 1 < count, j + 1, 2 * count - 1)
+        left = np.where((j >= 0) & (j < count), count + j, np.where(j < 0, 0, 2 * count - 1))
+        weight = whole * np.exp(-loss * np.stack((j + 1 - place, place - j), axis=-1))
+        return np.stack((right, left), axis=-1), weight
+
+    def _row(self, channel: Channel, decay: float, size: int) -> Real:
+        """Energy per metre (J/m) at a channel per energy of every subsystem."""
         row = np.zeros(size)
         layer = {"rail": 0, "slab": 1, "support_layer": 2}[channel.layer]
-        x = self.scenario.channel_x(channel)
+        base = 2 * layer * self.segments
+        if base >= size:
+            return row
+        x = self._sensor_x(channel)
         place = x / self._segment - 0.5
         j = min(max(math.floor(place), 0), self.segments - 2)
         s = min(max(place - j, 0.0), 1.0)
-        track = self.scenario.track
-        mass = (
-            2 * track.rail.mass_per_length,
-            track.slab.mass_per_length,
-            track.support_layer.mass_per_length,
-        )[layer]
-        base = 2 * layer * self.segments
         if layer == 0:
             # each node speaks for the wave that passes it, carried to the channel
-            loss = float(self._decay[j, cell]) * self._segment
+            loss = decay * self._segment
             right = 0.5 * np.exp([-loss * s, loss * (1 - s)])
             left = 0.5 * np.exp([loss * s, -loss * (1 - s)])
         else:
             right = left = np.array([1 - s, s])
         for direction, share in ((0, right), (1, left)):
             at = base + direction * self.segments + j
-            row[at : at + 2] = share / (mass * self._segment)
+            row[at : at + 2] = share / self._segment
         return row
 
-    def _place_in_bay(self, x: float) -> float:
-        fastening = self.scenario.track.fastening
-        first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
-        return float((x - first + fastening.spacing / 2) % fastening.spacing)
-
-    def _nearest_row(self, x: float) -> float:
-        fastening = self.scenario.track.fastening
-        first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
-        return first + round((x - first) / fastening.spacing) * fastening.spacing
-
-    def _pattern(self, channel: Channel) -> Real:
-        """Mean square at the channel's place in the bay relative to the bay's mean, (N,)."""
+    def _sensor_x(self, channel: Channel) -> float:
+        """Place (m) of a channel; of its fastening if it shows that one's force."""
         x = self.scenario.channel_x(channel)
-        if channel.quantity == "fastening_force":
-            x = self._nearest_row(x)
-        waves = self.waves
-        field = waves.solution.travelling([self._place_in_bay(x)])
-        chosen = field.strain_pattern if channel.quantity == "strain" else field.pattern
-        return waves.cells.sum(chosen[:, 0] * waves.weights)
+        if channel.quantity != "fastening_force":
+            return x
+        spacing, first = self._bays()
+        return first + (round((x - first) / spacing - 0.5) + 0.5) * spacing
 
-    def _near_field(self, channel: Channel) -> tuple[Real, Real] | None:
-        """Exact direct field less the travelling wave, per <F^2> of a wheel near the channel.
+    def _bays(self) -> tuple[float, float]:
+        """Length of a bay and start of one of them (m); a fastening is in its middle."""
+        fastening = self.scenario.track.fastening
+        first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
+        return fastening.spacing, first - fastening.spacing / 2
 
-        Returns:
-            positions (m) of the wheel, mean square velocity per square force there (N, n).
+    def _shown(self) -> Real:
+        """Mean square of the channels per mean square force of a wheel, (X, N, C).
+
+        Exact for the direct field on the infinite periodic track, mean over the frequencies of
+        a cell, velocity kind.
         """
-        if channel.layer != "rail" or channel.quantity != "motion":
-            return None
-        waves, periodic = self.waves, self.waves.periodic
-        cells, solution, omega = waves.cells, waves.solution, waves.cells.omega
-        soft = 1 / (2 * self.scenario.contact.stiffness)
-        x = self.scenario.channel_x(channel)
-        place = self._place_in_bay(x)
-        offset = np.arange(-NEAR_BAYS * 8, NEAR_BAYS * 8 + 1) / 8 * periodic.spacing
-        gain = 1 / np.abs(waves.receptances + soft) ** 2
-        mean_gain = cells.band_mean(gain.mean(axis=0)) * POINTS_PER_BAND
-        exact = np.empty((len(cells.band), len(offset)))
-        for i, d in enumerate(offset):
-            at = solution.receptance(place + d, place + d)
-            speed = np.abs(omega * solution.receptance(place + d, place)) ** 2
-            exact[:, i] = cells.sum(speed / np.abs(at + soft) ** 2) / mean_gain
-        power = ((1j * omega * waves.receptances).real * gain).mean(axis=0) * waves.share
-        power = cells.sum(power) / mean_gain
-        far = power / (2 * periodic.beam.mass_per_length * waves.velocity) * self._pattern(channel)
-        near = exact - far[:, None] * np.exp(-waves.decay[:, None] * np.abs(offset))
-        # leave the far field smoothly
-        fade = np.clip((NEAR_BAYS - np.abs(offset) / periodic.spacing) / 0.5, 0, 1)
-        return x + offset, near * fade
+        spacing, first = self._bays()
+        omega, cells = self.cells.omega, len(self.cells.line)
+        out = np.empty((len(self.places), cells, len(self._channels)))
+        inside = (np.arange(PLACES_PER_BAY) + 0.5) / PLACES_PER_BAY * spacing
+        groups = [(RING, self.waves.second.mobility <= 0)]
+        groups.append((UNDAMPED_RING, ~groups[0][1]))
+        beds: dict[bool, Bed] = {True: self.scenario.track.bed_on_bridge}
+        beds[False] = self.scenario.track.bed_on_subgrade
+        on_bridge = [
+            any(a <= self.scenario.channel_x(c) <= b for a, b in self.scenario.line.span_bounds)
+            for c in self._channels
+        ]
+        at = np.floor((self.places - first) / spacing * PLACES_PER_BAY + 1e-9).astype(np.intp)
+        for bridge in sorted(set(on_bridge)):
+            track = LayeredTrack.of_track(
+                self.scenario.track, beds[bridge], *self._common, LIFETIME
+            )
+            for ring, chosen in groups:
+                some = np.repeat(chosen, POINTS_PER_CELL)
+                if not some.any():
+                    continue
+                solution = track.solve(omega[some], ring)
+                for c, channel in enumerate(self._channels):
+                    if on_bridge[c] != bridge:
+                        continue
+                    x = self._sensor_x(channel)
+                    bay = math.floor((x - first) / spacing)
+                    number = at - bay * PLACES_PER_BAY
+                    bays = min(int(np.abs(number).max()) // PLACES_PER_BAY + 1, ring // 2 - 1)
+                    fields = solution.transfer(
+                        channel.layer, channel.quantity, x - first - bay * spacing, inside, bays
+                    )
+                    square = np.abs(omega[some, None, None] * fields) ** 2
+                    mean = square.reshape(chosen.sum(), POINTS_PER_CELL, -1).mean(axis=1)
+                    number = np.clip(number + bays * PLACES_PER_BAY, 0, mean.shape[1] - 1)
+                    out[:, chosen, c] = mean[:, number].T * self._factor(channel)[chosen] ** 2
+        return out
 
     def _factor(self, channel: Channel) -> Real:
-        """What a channel shows per velocity at its place, (N,); a spectrum of displacement kind."""
-        omega = self.waves.cells.centre
-        track = self.scenario.track
+        """Curvature to strain; the stiffness of a fastening that is unlike the usual one: (N,)."""
+        centre = self.cells.centre
         if channel.quantity == "strain":
-            if channel.layer == "rail":
-                return abs(channel.fibre) * omega  # the pattern is curvature per velocity
-            plate = track.slab if channel.layer == "slab" else track.support_layer
-            return abs(channel.fibre) * plate_beam(plate).wavenumber(omega) ** 2
+            return np.full(len(centre), abs(channel.fibre))
+        factor = {"fastening.stiffness": 1.0, "fastening.damping": 1.0}
         if channel.quantity == "fastening_force":
-            row = self._nearest_row(self.scenario.channel_x(channel))
-            pad = 2 * track.fastening.stiffness + 2j * omega * track.fastening.damping
-            for change in track.variation:
-                if change.start <= row <= change.end:
-                    if change.parameter == "fastening.stiffness":
-                        pad = pad.real * change.factor + 1j * pad.imag
-                    elif change.parameter == "fastening.damping":
-                        pad = pad.real + 1j * pad.imag * change.factor
-            return np.asarray(np.abs(pad))
-        return np.ones(len(omega))
+            row = self._sensor_x(channel)
+            for change in self.scenario.track.variation:
+                if change.parameter in factor and change.start <= row <= change.end:
+                    factor[change.parameter] *= change.factor
+        fastening = self.scenario.track.fastening
 
-    def powers(self, wheels: list[LocalWheel], places: Real) -> tuple[NDArray[np.intp], Real]:
-        """Power of wheels on the line into the rail's travelling segments.
+        def pad(stiffness: float, damping: float) -> Real:
+            spring, dashpot = fastening.stiffness * stiffness, fastening.damping * damping
+            return np.asarray(np.hypot(spring, centre * dashpot))
 
-        A wheel feeds the next segment centre on either side with what reaches it; the mean over
-        places is the whole power.
+        return np.asarray(pad(*factor.values()) / pad(1.0, 1.0))
 
-        Returns:
-            subsystems (2 wheels,), powers (2 wheels, N) W.
-        """
-        count = self.segments
-        subsystems = np.empty(2 * len(wheels), dtype=np.intp)
-        power = np.empty((2 * len(wheels), len(self.waves.decay)))
-        for i, (wheel, x) in enumerate(zip(wheels, places, strict=True)):
-            put = wheel.power[:, min(round(x / GRID), len(wheel.grid) - 1)] / 2
-            place = x / self._segment - 0.5
-            j = math.floor(place)
-            loss = self._decay[min(max(j, 0), count - 1)] * self._segment
-            whole = put * loss / -np.expm1(-loss)
-            # the ends reflect what would pass them
-            subsystems[2 * i] = j + 1 if j + 1 < count else 2 * count - 1
-            subsystems[2 * i + 1] = count + j if j >= 0 else 0
-            power[2 * i] = whole * np.exp(-loss * (j + 1 - place))
-            power[2 * i + 1] = whole * np.exp(-loss * (place - j))
-        return subsystems, power
 
-    def next_frame(self, wheels: list[LocalWheel], places: Real) -> Real:
-        """Local channel signals of the next ``hop`` samples, (hop, D, C).
+def local_cells(scenario: Scenario, crossover: float, frame: float) -> tuple[Real, Cells]:
+    """Edges (Hz) of the local bands, and cells as wide as frames of 2 ``frame`` (s) part them."""
+    edges = band_edges(crossover, BAND_MARGIN * scenario.solution.frequency_limit)
+    return edges, Cells.between(edges, 0.5 / frame)
+
+
+def local_tables(scenario: Scenario, crossover: float, frame: float) -> LocalTables:
+    """Tables of a scenario's line, from the disk cache when it was prepared before."""
+    part = scenario.model_dump(mode="json", include={"track", "line", "channel"})
+    limit = scenario.solution.frequency_limit
+    key = {**part, "local": [LOCAL_FORMAT, crossover, limit, frame]}
+    return cached(key, LocalTables, lambda: LocalLine(scenario, crossover, frame).tables())
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sum_squares(
+    response: Real,
+    first: NDArray[np.intp],
+    lag: NDArray[np.intp],
+    place: NDArray[np.intp],
+    square: Real,
+    total: Real,
+) -> None:
+    """total (N, C) = sum over wheels of response (lags, P, N, C) times their squares (E, N)."""
+    total[:] = 0.0
+    for e in range(lag.size):
+        table = response[lag[e], place[e]]
+        for n in range(first[lag[e]], total.shape[0]):
+            for c in range(total.shape[1]):
+                total[n, c] += table[n, c] * square[e, n]
+
+
+class LocalField:
+    """Signals of the local set at the channels, frame by frame.
+
+    Args:
+        scenario: line, track, channels, seed.
+        crossover: lowest frequency of the local set (Hz).
+        derivatives: 0, 1, 2 for displacement, velocity, acceleration of the channels.
+
+    Attributes:
+        edges: (B + 1,) of the bands (Hz). cells: of frequency.
+        hop: samples of a frame.
+        heard: (C,) whether a channel has a local part.
+        tables: of the line.
+    """
+
+    def __init__(self, scenario: Scenario, crossover: float, derivatives: tuple[int, ...]) -> None:
+        solution = scenario.solution
+        self.step: float = solution.step_ns * 1e-9
+        self.hop = max(32, 2 ** round(math.log2(FRAME_TIME / self.step)))
+        self.edges, self.cells = local_cells(scenario, crossover, self.frame)
+        self.tables = local_tables(scenario, crossover, self.frame)
+        self.heard = np.array([is_heard(channel) for channel in scenario.channel], dtype=bool)
+        count = int(self.heard.sum())
+        seeds = np.random.SeedSequence(solution.seed).spawn(count)
+        self._random = [np.random.default_rng(seed) for seed in seeds]
+        # places and squares of the wheels of past frames, newest first
+        self._past: deque[tuple[NDArray[np.intp], Real]] = deque(maxlen=LAGS[-1])
+        omega = self.cells.line * np.pi / self.frame
+        self._factors: Complex = np.array([(1j * omega) ** (d - 1) for d in derivatives])
+        self._window = np.sin(np.pi * (np.arange(2 * self.hop) + 0.5) / (2 * self.hop))
+        self._overlap = np.zeros((self.hop, len(derivatives), count))
+        self._quiet = LAGS[-1]
+
+    @property
+    def frame(self) -> float:
+        """Time step of the power balance (s)."""
+        return float(self.hop * self.step)
+
+    def mean_square(self, wheels: Sequence[LocalWheel], places: Real) -> Real:
+        """Mean square velocity at the heard channels in the next frame, (N, C).
 
         Args:
             wheels: those on the line, places: (m) in the middle of the frame.
         """
-        channels = len(self._random)
+        last = self.tables.response.shape[1] - 1
+        index = np.zeros(len(wheels), dtype=np.intp)
+        square = np.zeros((len(wheels), len(self.cells.line)))
+        for i, wheel in enumerate(wheels):
+            index[i] = min(max(round(float(places[i]) / wheel.step), 0), last)
+            square[i] = wheel.square[index[i]]
+        self._past.appendleft((index, square))
+        middles = [(begin + end - 1) // 2 for begin, end in itertools.pairwise(LAGS)]
+        chosen = [(lag, self._past[m]) for lag, m in enumerate(middles) if m < len(self._past)]
+        lags = np.concatenate([np.full(len(part[0]), lag) for lag, part in chosen])
+        total = np.zeros((square.shape[1], len(self._random)))
+        _sum_squares(
+            self.tables.response,
+            self.tables.first,
+            lags,
+            np.concatenate([part[0] for _, part in chosen]),
+            np.concatenate([part[1] for _, part in chosen]),
+            total,
+        )
+        return total
+
+    def next_frames(self, frames: Sequence[tuple[Sequence[LocalWheel], Real]]) -> Real:
+        """Local channel signals of the next frames, (frames * hop, D, C).
+
+        Args:
+            frames: wheels on the line and their places (m) in the middle of every frame.
+        """
+        count, channels, derivatives = len(frames), len(self._random), len(self._factors)
+        out = np.zeros((count + 1, self.hop, derivatives, channels))
+        out[0] = self._overlap
         if not channels:
-            return np.zeros((self.hop, len(self.derivatives), 0))
-        if wheels:
-            self._quiet = 0
-        elif self._quiet > MOST_LAGS:
-            tail, self._overlap = self._overlap, np.zeros_like(self._overlap)
-            return tail
-        else:
-            self._quiet += 1
-        self._past.appendleft(self.powers(wheels, places))
-        square = np.zeros((channels, len(self.waves.decay)))
-        for kernel, (subsystems, power) in zip(self._kernels, self._past, strict=False):
-            square += np.einsum("knc,kn->cn", kernel[subsystems], power)
-        for c, near in enumerate(self._near):
-            if near is None:
-                continue
-            positions, table = near
-            for wheel, x in zip(wheels, places, strict=True):
-                if positions[0] <= x <= positions[-1]:
-                    column = round((x - positions[0]) / (positions[1] - positions[0]))
-                    force = wheel.square[:, min(round(x / GRID), len(wheel.grid) - 1)]
-                    square[c] += table[:, column] * force
-        square = np.maximum(square, 0.0) * self._scale**2
-        # irfft of N bins has the variance 2/N^2 sum <|X|^2>, and <|X|^2> = 2 level^2
-        level = np.sqrt(square @ self._spread) * self.hop
-        spectrum = np.empty(level.shape, dtype=np.complex128)
-        for c, random in enumerate(self._random):
-            draw = random.standard_normal((2, level.shape[1]))
-            spectrum[c] = level[c] * (draw[0] + 1j * draw[1])
-        out: Real = self._overlap.copy()
-        for d, derivative in enumerate(self.derivatives):
-            shaped = spectrum * (1j * self._omega) ** (derivative - 1)
-            signal = np.fft.irfft(shaped, 2 * self.hop, axis=1).T * self._window[:, None]
-            out[:, d] += signal[: self.hop]
-            self._overlap[:, d] = signal[self.hop :]
-        return out
+            return out[:-1].reshape(-1, derivatives, channels)
+        sounding, squares = [], []
+        for number, (wheels, places) in enumerate(frames):
+            self._quiet = 0 if len(wheels) else self._quiet + 1
+            if self._quiet <= LAGS[-1]:
+                sounding.append(number)
+                squares.append(self.mean_square(wheels, places))
+        if sounding:
+            # irfft of N lines has the variance 2/N^2 sum <|X|^2>, and <|X|^2> = 2 level^2
+            level = np.sqrt(np.stack(squares)).transpose(2, 0, 1) * self.hop  # (C, frames, N)
+            lines = self.cells.line
+            drawn = np.empty(level.shape, dtype=np.complex128)
+            for c, random in enumerate(self._random):
+                draw = random.standard_normal((len(sounding), 2, len(lines)))
+                drawn[c] = level[c] * (draw[:, 0] + 1j * draw[:, 1])
+            spectrum = np.zeros((*level.shape[:2], self.hop + 1), dtype=np.complex128)
+            for d, factor in enumerate(self._factors):
+                spectrum[:, :, lines] = drawn * factor
+                signal = scipy.fft.irfft(spectrum, 2 * self.hop, axis=2) * self._window
+                for i, number in enumerate(sounding):
+                    out[number, :, d] += signal[:, i, : self.hop].T
+                    out[number + 1, :, d] += signal[:, i, self.hop :].T
+        self._overlap = out[-1].copy()
+        return out[:-1].reshape(-1, derivatives, channels)
 
 
 def _segments(scenario: Scenario) -> tuple[float, int]:
@@ -664,7 +803,8 @@ def _fastening_states(scenario: Scenario, centres: Real) -> list[tuple[float, fl
     return states
 
 
-def _is_heard(channel: Channel) -> bool:
+def is_heard(channel: Channel) -> bool:
+    """Whether a channel has a local part: not on the bridge, no bearing force."""
     if channel.quantity == "bearing_force" or channel.layer == "bridge":
         return False
     return channel.quantity != "fastening_force" or channel.layer in ("rail", "slab")
@@ -682,12 +822,3 @@ def _slab_beam(track: Track) -> WaveBeam:
 
 def _speed_and_decay(beam: WaveBeam, omega: float) -> tuple[float, float]:
     return float(beam.group_velocity(omega)), 2 * float(beam.exponents(omega)[0].real)
-
-
-def _bin_shares(waves: RailWaves, frequency: Real) -> Real:
-    """Share of every cell's mean square that falls into every bin of a spectrum, (N, bins)."""
-    cells = waves.cells
-    bins = np.round(cells.omega / (2 * np.pi) / (frequency[1] - frequency[0])).astype(np.intp)
-    shares = np.zeros((len(cells.band), len(frequency)))
-    np.add.at(shares, (cells.of, np.minimum(bins, len(frequency) - 1)), waves.weights)
-    return shares

@@ -7,27 +7,18 @@ With complex modes normalised to ``phi.T (2 lambda M + C) phi = 1`` the receptan
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import json
 import math
-import os
-import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from importlib import metadata
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-import platformdirs
 import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from .beam import Array
+from .cache import cached
 from .errors import SolverError
 from .line import Structure, assemble
 from .scenario import Scenario
@@ -35,7 +26,6 @@ from .scenario import Scenario
 Complex = NDArray[np.complex128]
 
 FORMAT = 12
-CACHE_BYTES = 2 * 2**30
 
 RESIDUAL_REACH = 8.0
 """Distance (m) from a channel beyond which dropped modes do not answer a wheel; faded out over
@@ -449,66 +439,17 @@ def modal_line(scenario: Scenario) -> ModalLine:
     Raises:
         SolverError: see :func:`real_modes` and :func:`complex_modes`.
     """
-    path = _cache_path(scenario)
-    found = _read(path)
-    if found is None:
-        found = build_modal_line(assemble(scenario))
-        _write(path, found)
-    return found
+    return cached(_cache_key(scenario), ModalLine, lambda: build_modal_line(assemble(scenario)))
 
 
-def _cache_path(scenario: Scenario) -> Path:
+def _cache_key(scenario: Scenario) -> dict[str, object]:
     part = scenario.model_dump(
         mode="json", include={"track", "line", "channel", "solution", "irregularity"}
     )
-    part = {
+    return {
         "track": part["track"],
         "line": part["line"],
         "channel": part["channel"],
         "solution": {key: part["solution"][key] for key in ("frequency_limit", "sines")},
         "format": FORMAT,
-        "version": _version(),
     }
-    digest = hashlib.sha256(json.dumps(part, sort_keys=True).encode()).hexdigest()[:32]
-    return Path(platformdirs.user_cache_dir("trackvib", appauthor=False)) / f"line-{digest}.npz"
-
-
-def _version() -> str:
-    try:
-        return metadata.version("trackvib")
-    except metadata.PackageNotFoundError:
-        return "source"
-
-
-def _read(path: Path) -> ModalLine | None:
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            values = {field.name: stored[field.name] for field in fields(ModalLine)}
-        os.utime(path)
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-        return None
-    for name in ("grid_start", "grid_step", "length"):
-        values[name] = float(values[name])
-    values["solved"] = int(values["solved"])
-    return ModalLine(**values)
-
-
-def _write(path: Path, line: ModalLine) -> None:
-    """Store atomically and keep the cache bounded; a cache that cannot be written is skipped."""
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, **{f.name: getattr(line, f.name) for f in fields(ModalLine)})
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-        stored = sorted(path.parent.glob("line-*.npz"), key=lambda p: p.stat().st_mtime)
-        total = sum(p.stat().st_size for p in stored)
-        for old in stored[:-1]:
-            if total <= CACHE_BYTES:
-                break
-            total -= old.stat().st_size
-            old.unlink()

@@ -36,6 +36,7 @@ GRAVITY = 9.81
 """Acceleration of free fall (m/s²)."""
 
 Layer = Literal["rail", "slab", "support_layer", "bridge"]
+Quantity = Literal["motion", "strain", "fastening_force", "bearing_force"]
 
 
 def _quantity(unit: str, meaning: str, **rules: Any) -> Any:
@@ -457,7 +458,7 @@ class Channel(Section):
     """One place where the solver reports motion, strain or a force."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)
-    quantity: Literal["motion", "strain", "fastening_force", "bearing_force"] = Field(
+    quantity: Quantity = Field(
         default="motion",
         description=(
             "motion: displacement, velocity, acceleration; strain: bending strain at a fibre; "

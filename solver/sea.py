@@ -11,12 +11,13 @@ reversed, n_r eta_rs = n_s' eta_s'r'.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import SolverError
@@ -36,7 +37,7 @@ class PowerBalance:
     Attributes:
         omega: centre of the band (rad/s).
         loss: (N,) loss factors eta_r (-).
-        coupling: (N, N) coupling loss factors, ``[r, s]`` is eta_rs from r to s (-).
+        coupling: (N, N) coupling loss factors, ``[r, s]`` is eta_rs from r to s (-), kept sparse.
         modal_density: (N,) n_r (s/rad).
         reverse: (N,) subsystem with the directions of travel reversed; itself if it has none.
 
@@ -46,35 +47,37 @@ class PowerBalance:
 
     omega: float
     loss: Real
-    coupling: Real
+    coupling: sp.csr_array
     modal_density: Real
     reverse: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def __post_init__(self) -> None:
         """Check signs and reciprocity."""
         size = len(self.loss)
+        object.__setattr__(self, "coupling", sp.csr_array(self.coupling))
         if not len(self.reverse):
             object.__setattr__(self, "reverse", np.arange(size))
-        for name, values in (("eta_r", self.loss), ("eta_rs", self.coupling)):
-            if np.min(values) < 0:
+        for name, values in (("eta_r", self.loss), ("eta_rs", self.coupling.data)):
+            if np.min(values, initial=0.0) < 0:
                 raise SolverError(f"loss factor {name} = {np.min(values):g}; limit >= 0")
-        flow = self.modal_density[:, None] * self.coupling
-        other = flow[np.ix_(self.reverse, self.reverse)].T
-        worst = float(np.abs(flow - other).max(initial=0.0))
-        scale = float(flow.max(initial=0.0))
-        if worst > RECIPROCITY * scale:
-            r, s = np.unravel_index(int(np.argmax(np.abs(flow - other))), flow.shape)
+        flow = sp.csr_array(sp.diags_array(self.modal_density) @ self.coupling)
+        error = abs(flow - flow[self.reverse][:, self.reverse].T).tocoo()
+        scale = float(flow.data.max(initial=0.0))
+        if error.nnz and error.data.max() > RECIPROCITY * scale:
+            at = int(np.argmax(error.data))
+            r, s = int(error.coords[0][at]), int(error.coords[1][at])
+            other = flow[self.reverse[s], self.reverse[r]]
             raise SolverError(
                 f"reciprocity n_r eta_rs = n_s eta_sr between subsystems {r} and {s}: "
-                f"{flow[r, s]:.6g} s against {other[r, s]:.6g} s; "
+                f"{flow[r, s]:.6g} s against {other:.6g} s; "
                 f"limit {RECIPROCITY:g} of the largest"
             )
 
     @property
-    def matrix(self) -> Real:
+    def matrix(self) -> sp.csc_array:
         """A of dE/dt = P - A E (1/s), shape (N, N)."""
         total = self.loss + self.coupling.sum(axis=1)
-        return np.asarray(self.omega * (np.diag(total) - self.coupling.T))
+        return sp.csc_array(self.omega * (sp.diags_array(total) - self.coupling.T))
 
     def steady(self, power: ArrayLike) -> Real:
         """Energies E (J) under constant powers (W), shapes (N,) or (N, k).
@@ -82,13 +85,10 @@ class PowerBalance:
         Raises:
             SolverError: no loss anywhere, or a negative energy.
         """
-        try:
-            energy = np.linalg.solve(self.matrix, np.asarray(power, dtype=np.float64))
-        except np.linalg.LinAlgError:
-            raise SolverError(
-                "power balance: largest loss factor = 0; a steady state needs > 0"
-            ) from None
-        return checked_energy(np.asarray(energy))
+        if not np.any(self.loss > 0):
+            raise SolverError("power balance: largest loss factor = 0; a steady state needs > 0")
+        solver = scipy.sparse.linalg.splu(self.matrix)
+        return checked_energy(np.asarray(solver.solve(np.asarray(power, dtype=np.float64))))
 
     def propagator(self, step: float) -> tuple[Real, Real]:
         """(N, N) matrices of E(t + step) = decay E(t) + gain P for power constant in the step.
@@ -97,7 +97,7 @@ class PowerBalance:
         """
         size = len(self.loss)
         block = np.zeros((2 * size, 2 * size))
-        block[:size, :size] = -self.matrix * step
+        block[:size, :size] = -self.matrix.toarray() * step
         block[:size, size:] = np.eye(size) * step
         result = scipy.linalg.expm(block)
         return np.asarray(result[:size, :size]), np.asarray(result[:size, size:])
@@ -219,46 +219,55 @@ class Chain:
 
 
 def chain_balance(
-    omega: float,
-    chains: list[Chain],
-    conductances: list[Real],
+    omega: float, chains: list[Chain], conductances: list[Real], *, open_ends: bool = False
 ) -> PowerBalance:
     """Balance of layers on top of each other, each cut at the same places.
 
-    Subsystem ``(2 layer + direction) S + segment``; direction 0 travels right. Ends reflect.
+    Subsystem ``(2 layer + direction) S + segment``; direction 0 travels right.
 
     Args:
         omega: centre of the band (rad/s).
         chains: the layers, top first, S segments each.
         conductances: (S,) arrays, omega n eta per metre between layer i and i + 1 (1/m).
+        open_ends: energy that reaches an end leaves the line; else the ends reflect it.
     """
     segments = len(chains[0].decay)
     size = 2 * len(chains) * segments
     loss, density = np.zeros(size), np.zeros(size)
-    coupling = np.zeros((size, size))
     reverse = np.zeros(size, dtype=np.intp)
-
-    def at(layer: int, direction: int, segment: int) -> int:
-        return (2 * layer + direction) * segments + segment
-
+    inner = np.arange(segments)
+    parts: list[tuple[NDArray[np.intp], NDArray[np.intp], Real]] = []
     for layer, chain in enumerate(chains):
         speed, decay, length = chain.group_velocity, chain.decay, chain.length
-        for j, direction in itertools.product(range(segments), (0, 1)):
-            r = at(layer, direction, j)
-            ahead = j + 1 - 2 * direction
-            inside = 0 <= ahead < segments
-            reverse[r] = at(layer, 1 - direction, j)
-            loss[r] = decay[j] * speed[j] / omega
+        # the mean decay of both segments, so that a change of damping reflects nothing
+        between = np.array(
+            [chain_rate(1.0, float(d), length) for d in (decay[1:] + decay[:-1]) / 2]
+        )
+        ends = [chain_rate(1.0, float(d), length) for d in (decay[0], decay[-1])]
+        for direction in (0, 1):
+            base = (2 * layer + direction) * segments
+            other = (2 * layer + 1 - direction) * segments
+            own = base + inner
+            reverse[own] = other + inner
+            loss[own] = decay * speed / omega
             # half of the modes of the segment, length / (pi c_g), travel either way
-            density[r] = length / (2 * math.pi * speed[j])
-            s = at(layer, direction, ahead) if inside else reverse[r]
-            # the mean decay of both segments, so that a change of damping reflects nothing
-            mean = (decay[j] + decay[ahead]) / 2 if inside else decay[j]
-            coupling[r, s] += chain_rate(1.0, float(mean), length) * speed[j] / omega
+            density[own] = length / (2 * math.pi * speed)
+            start, ahead = (own[:-1], own[1:]) if direction == 0 else (own[1:], own[:-1])
+            source = inner[:-1] if direction == 0 else inner[1:]
+            parts.append((start, ahead, between * speed[source] / omega))
+            last = segments - 1 if direction == 0 else 0
+            rate = ends[1 - direction] * speed[last] / omega
+            if open_ends:
+                loss[base + last] += rate
+            else:
+                parts.append((own[[last]], other + inner[[last]], np.array([rate])))
     for layer, conduct in enumerate(conductances):
         share = conduct * chains[layer].length / 4 / omega
-        for j, a, b in itertools.product(range(segments), (0, 1), (0, 1)):
-            r, s = at(layer, a, j), at(layer + 1, b, j)
-            coupling[r, s] += share[j] / density[r]
-            coupling[s, r] += share[j] / density[s]
+        for a in (0, 1):
+            for b in (0, 1):
+                r, s = (2 * layer + a) * segments + inner, (2 * layer + 2 + b) * segments + inner
+                parts.append((r, s, share / density[r]))
+                parts.append((s, r, share / density[s]))
+    row, column, value = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    coupling = sp.csr_array((value, (row, column)), shape=(size, size))
     return PowerBalance(omega, loss, coupling, density, reverse)

@@ -12,13 +12,13 @@ so exp(s x) needs ``EI s^4 + (Z EI/kGA + rho I omega^2) s^2 + Z (rho I omega^2/k
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
-from .scenario import Bed, Plate, Track
+from .scenario import Bed, Layer, Plate, Quantity, Track
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -165,21 +165,20 @@ def pinned_pinned_frequency(track: Track) -> float:
 
 @dataclass(frozen=True, slots=True)
 class BlochField:
-    """The travelling Bloch wave at every frequency, per unit mean power it carries.
+    """A travelling Bloch wave at every frequency.
 
     Attributes:
         decay: energy decay along the track, power ~ exp(-decay x) (1/m), shape (F,).
-        energy_velocity: power / (m' <v^2>) with <v^2> the mean over a bay (m/s), shape (F,).
-        pattern: |v(x)|^2 / <v^2> at the places asked for, shape (F, P).
-        strain_pattern: |theta'(x)|^2 / <v^2> (s^2/m^2 * 1/m^2), shape (F, P).
+        energy_velocity: power / (m' <v^2> + rho I <theta'^2>), means over a bay of transverse and
+            rotational motion, twice the kinetic energy (m/s), shape (F,).
+        transverse: m' <v^2> per m' <v^2> + rho I <theta'^2>, shape (F,).
         share: part of a load's power, mean over the bay, that this wave takes; the rest stays in
             the near field, shape (F,).
     """
 
     decay: Real
     energy_velocity: Real
-    pattern: Real
-    strain_pattern: Real
+    transverse: Real
     share: Real
 
 
@@ -298,9 +297,9 @@ class PeriodicRail:
         solution = self.solve(omega)
         return np.stack([solution.receptance(x, x) for x in self.load_positions(count)])
 
-    def travelling(self, omega: ArrayLike, places: ArrayLike = ()) -> BlochField:
+    def travelling(self, omega: ArrayLike) -> BlochField:
         """See :meth:`BlochSolution.travelling`."""
-        return self.solve(omega).travelling(places)
+        return self.solve(omega).travelling()
 
 
 class BlochSolution:
@@ -375,44 +374,36 @@ class BlochSolution:
             out[:, chosen] = (shape[:, side, None] * powers).sum(axis=1)
         return out
 
-    def travelling(self, places: ArrayLike = ()) -> BlochField:
-        """Decay, energy velocity and bay pattern of the travelling Bloch wave.
+    def travelling(self, second: bool = False) -> BlochField:
+        """Decay, energy velocity and share of the Bloch wave that carries most of the power.
 
         Args:
-            places: positions (m) from the start of a bay, shape (P,).
+            second: of the other right-going wave. Above sqrt(kGA/rho I) a Timoshenko beam has a
+                second travelling wave; below, and in an Euler-Bernoulli beam, it is a near field.
         """
-        w, rail = self.omega, self.rail
-        x = np.atleast_1d(np.asarray(places, dtype=np.float64)) % rail.spacing
-        chosen, share = self._main_wave()
-        row = np.arange(w.size)
+        rail, row = self.rail, np.arange(self.omega.size)
+        carried, given = self._carried()
+        chosen = np.argmax(carried, axis=0)
+        if second:
+            chosen = 1 - chosen
         wave = self.states[row, :, chosen]
         decay = -2 * np.log(np.abs(self.values[row, chosen])) / rail.spacing
 
-        def square(place: float) -> tuple[Real, Real]:
+        def square(place: float) -> Real:
             # Removing the mean decay leaves the periodic part of the wave.
-            state = (self._to(place) @ wave[:, :, None])[:, :, 0]
-            gain = np.exp(decay * place)
-            speed = np.abs(w * state[:, 0]) ** 2 * gain
-            bending = np.abs(state[:, 3] / rail.beam.bending_stiffness) ** 2 * gain
-            return speed, bending
+            state = (self._to(place)[:, :2] @ wave[:, :, None])[:, :, 0]
+            speed = np.abs(self.omega[:, None] * state) ** 2
+            return np.asarray(speed * np.exp(decay * place)[:, None])
 
-        samples = [square(place)[0] for place in rail.load_positions(24)]
-        mean = np.mean(samples, axis=0)
-        power = self._power(wave)
+        mean = np.mean([square(float(place)) for place in rail.load_positions(24)], axis=0)
+        transverse = rail.beam.mass_per_length * mean[:, 0]
+        energy = transverse + rail.beam.rotary_inertia * mean[:, 1]
         # The rail itself loses nothing: the power falls in one step at the support in mid-bay.
         # With the smooth decay removed its mean over the bay is the factor sinh(h)/h.
         h = decay * rail.spacing / 2
-        mean_power = power * np.sinh(h) / h
-        patterns = [square(float(place)) for place in x]
-        speed = np.stack([p[0] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
-        bending = np.stack([p[1] for p in patterns], axis=-1) if patterns else np.zeros((w.size, 0))
-        return BlochField(
-            decay,
-            mean_power / (rail.beam.mass_per_length * mean),
-            speed / mean[:, None],
-            bending / mean[:, None],
-            share,
-        )
+        mean_power = self._power(wave) * np.sinh(h) / h
+        share = np.clip(carried[chosen, row] / given, 0.0, 1.0)
+        return BlochField(decay, mean_power / energy, transverse / energy, share)
 
     def _power(self, wave: Complex) -> Real:
         """Power (twice the mean) that passes the start of the bay towards +x, (F,)."""
@@ -420,11 +411,8 @@ class BlochSolution:
         passed = wave[:, 2] * velocity[:, 0].conj() + wave[:, 3] * velocity[:, 1].conj()
         return np.asarray(-passed.real)
 
-    def _main_wave(self) -> tuple[NDArray[np.intp], Real]:
-        """Which of the two right-going waves carries more, and its part of the input power, (F,).
-
-        Above sqrt(kGA/rho I) a Timoshenko beam has a second travelling wave.
-        """
+    def _carried(self) -> tuple[Real, Real]:
+        """Power (2, F) that a load hands to the right-going waves, half of all it gives (F,)."""
         carried = np.zeros((2, self.omega.size))
         given = np.zeros(self.omega.size)
         for load in self.rail.load_positions(6):
@@ -434,6 +422,232 @@ class BlochSolution:
                 # amplitudes refer to the bay's start; the support in mid-bay takes its part
                 passed = np.abs(self.values[:, j]) ** 2 if load > self.rail.spacing / 2 else 1.0
                 carried[j] += amplitude[:, j] * self._power(self.states[:, :, j]) * passed
-        chosen = np.argmax(carried, axis=0)
-        best = carried[chosen, np.arange(self.omega.size)]
-        return chosen, np.clip(best / given, 0.0, 1.0)
+        return carried, given
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """A field of decaying waves, sum of ``amplitude * exp(-exponent |x|)`` per unit force at 0.
+
+    Attributes:
+        amplitude, exponent: (F, K); the exponents in 1/m.
+    """
+
+    amplitude: Complex
+    exponent: Complex
+
+    def comb(self, offset: float, period: Complex, spacing: float) -> Complex:
+        """sum over n of the field at n spacing + offset times period^-n, (F, N).
+
+        Args:
+            offset: m, less than the spacing either way.
+            period: (N,) exp(i kappa spacing) of wavenumbers kappa.
+        """
+        total: Complex = np.zeros((len(self.exponent), len(period)), dtype=np.complex128)
+        for j in range(self.exponent.shape[1]):
+            s = self.exponent[:, j, None]
+            pass_on = np.exp(-s * spacing)
+            ahead, behind = pass_on / period, pass_on * period
+            total += self.amplitude[:, j, None] * (
+                np.exp(-s * abs(offset))
+                + np.exp(-s * offset) * ahead / (1 - ahead)
+                + np.exp(s * offset) * behind / (1 - behind)
+            )
+        return total
+
+
+@dataclass(frozen=True, slots=True)
+class LayeredTrack:
+    """Infinite periodic track: rail, fastenings, slab, mortar, support layer, bed.
+
+    Exact by a Floquet transform of the fastenings' forces over one Brillouin zone. Slab and
+    layer are Euler-Bernoulli beams, the ground or girder below the bed is at rest.
+
+    Attributes:
+        rail: the free rail.
+        spacing: of the fastenings (m), one in the middle of every bay [0, spacing).
+        stiffness, damping: of a fastening (N/m, N*s/m), both rails.
+        pad_length: length over which a fastening acts (m).
+        slab, layer: the free plates.
+        mortar, bed: what joins slab and layer, and layer and ground.
+    """
+
+    rail: WaveBeam
+    spacing: float
+    stiffness: float
+    damping: float
+    pad_length: float
+    slab: WaveBeam
+    layer: WaveBeam
+    mortar: Bed
+    bed: Bed
+
+    @classmethod
+    def of_track(
+        cls,
+        track: Track,
+        bed: Bed,
+        stiffness_factor: float = 1.0,
+        damping_factor: float = 1.0,
+        lifetime: float = math.inf,
+    ) -> LayeredTrack:
+        """A track on one of its beds.
+
+        Args:
+            track: its properties.
+            bed: below the support layer.
+            stiffness_factor, damping_factor: on its fastenings.
+            lifetime: time (s) in which the energy of the free rail falls to 1/e.
+        """
+        fastening = track.fastening
+        rail = rail_beam(track)
+        return cls(
+            replace(rail, support_damping=rail.mass_per_length / lifetime),
+            fastening.spacing,
+            2 * fastening.stiffness * stiffness_factor,
+            2 * fastening.damping * damping_factor,
+            fastening.pad_length,
+            plate_beam(track.slab),
+            plate_beam(track.support_layer),
+            track.mortar,
+            bed,
+        )
+
+    def rail_waves(self, omega: Real) -> Waves:
+        """Deflection of the free rail per point force on it."""
+        beam = self.rail
+        s = beam.exponents(omega)
+        square = s**2
+        numerator = (
+            beam.bending_stiffness * square / beam.shear_stiffness
+            - 1
+            + (beam.rotary_inertia * omega**2 / beam.shear_stiffness)[:, None]
+        )
+        gap = beam.bending_stiffness * (square - square[:, ::-1])
+        return Waves(numerator / gap / (2 * s), s)
+
+    def plate_waves(self, omega: Real) -> tuple[Waves, Waves]:
+        """Deflection of slab and of support layer per point force on the slab.
+
+        With D = EI kappa^4 + k - m omega^2 of either plate, k the springs that touch it, the slab
+        moves by D_f/(D_s D_f - k_m^2), the layer by k_m/(D_s D_f - k_m^2); partial fractions in
+        kappa^4, each with four roots.
+        """
+        mortar = self.mortar.width * (self.mortar.stiffness + 1j * omega * self.mortar.damping)
+        bed = self.bed.width * (self.bed.stiffness + 1j * omega * self.bed.damping)
+        ei_s, ei_f = self.slab.bending_stiffness, self.layer.bending_stiffness
+        c_s = (mortar - self.slab.mass_per_length * omega**2) / ei_s
+        c_f = (mortar + bed - self.layer.mass_per_length * omega**2) / ei_f
+        coupling = mortar**2 / (ei_s * ei_f)
+        root = np.sqrt(np.asarray((c_s - c_f) ** 2 + 4 * coupling, dtype=np.complex128))
+        fourth = np.stack((-c_s - c_f - root, -c_s - c_f + root), axis=-1) / 2
+        gap = fourth - fourth[:, ::-1]
+        slab = (fourth + c_f[:, None]) / (ei_s * gap)
+        layer = (mortar / (ei_s * ei_f))[:, None] / gap
+        s = np.sqrt(np.sqrt(fourth))
+        s = np.stack((s, 1j * s), axis=-1)
+        s = np.where(s.real < 0, -s, s).reshape(len(omega), 4)
+        single = np.asarray(-1 / (4 * s**3), dtype=np.complex128)
+        return (
+            Waves(single * np.repeat(slab, 2, axis=1), s),
+            Waves(single * np.repeat(layer, 2, axis=1), s),
+        )
+
+    def _pads(self) -> list[tuple[float, float]]:
+        middle = self.spacing / 2
+        if self.pad_length == 0:
+            return [(middle, 1.0)]
+        nodes, weights = np.polynomial.legendre.leggauss(4)
+        return [
+            (middle + self.pad_length / 2 * float(node), float(weight) / 2)
+            for node, weight in zip(nodes, weights, strict=True)
+        ]
+
+    def solve(self, omega: Real, ring: int = 512) -> LayeredSolution:
+        """The track at frequencies (rad/s), repeating after ``ring`` bays."""
+        return LayeredSolution(self, np.asarray(omega, dtype=np.float64), ring)
+
+
+class LayeredSolution:
+    """Transfer functions of a :class:`LayeredTrack` at given frequencies.
+
+    Args:
+        track: the track.
+        omega: (F,) rad/s.
+        ring: bays after which the track repeats; must be long against the decay of its waves.
+    """
+
+    def __init__(self, track: LayeredTrack, omega: Real, ring: int) -> None:
+        self.track, self.omega, self.ring = track, omega, ring
+        self._period = np.exp(2j * np.pi * (np.arange(ring) + 0.5) / ring)
+        self._rail = track.rail_waves(omega)
+        self._slab, self._layer = track.plate_waves(omega)
+        self._pads = track._pads()
+        self._combs: dict[float, Complex] = {}
+        pad = track.stiffness + 1j * omega * track.damping
+        count = len(self._pads)
+        self._joint = np.empty((len(omega), ring, count, count), dtype=np.complex128)
+        for p, (at, share) in enumerate(self._pads):
+            for q, (source, _) in enumerate(self._pads):
+                self._joint[:, :, p, q] = self._of(self._rail, at - source)
+                self._joint[:, :, p, q] += self._of(self._slab, at - source)
+            self._joint[:, :, p, p] += (1 / (share * pad))[:, None]
+
+    def _of(self, waves: Waves, offset: float) -> Complex:
+        return waves.comb(offset, self._period, self.track.spacing)
+
+    def _rail_comb(self, offset: float) -> Complex:
+        offset = round(offset, 9)
+        if offset not in self._combs:
+            self._combs[offset] = self._of(self._rail, offset)
+        return self._combs[offset]
+
+    def transfer(
+        self,
+        layer: Layer,
+        quantity: Quantity,
+        place: float,
+        loads: Real,
+        bays: int,
+    ) -> Complex:
+        """What a sensor shows per point force on the rail, (F, 2 bays + 1, P).
+
+        By reciprocity: the rail's field of a unit source at the sensor.
+
+        Args:
+            layer: rail, slab or support_layer.
+            quantity: motion (m/N), strain (curvature, 1/(m*N)) or force of the fastening of the
+                sensor's bay (N/N).
+            place: of the sensor in its bay (m).
+            loads: (P,) of the force in a bay (m); bays -bays ... bays from the sensor's.
+        """
+        own: Waves | None = None
+        sign = 1.0
+        if quantity == "fastening_force":
+            driven = np.ones((*self._joint.shape[:3], 1), dtype=np.complex128)
+        else:
+            own = {"rail": self._rail, "slab": self._slab}.get(layer, self._layer)
+            if quantity == "strain":
+                factor = own.exponent**2
+                if layer == "rail":
+                    beam = self.track.rail
+                    factor = factor + beam.inertia_term(self.omega)[:, None] / beam.shear_stiffness
+                own = Waves(own.amplitude * factor, own.exponent)
+            driven = np.stack([self._of(own, at - place) for at, _ in self._pads], axis=-1)
+            driven = driven[..., None]
+            sign = -1.0 if layer == "rail" else 1.0
+        if len(self._pads) > 1:
+            forces = np.linalg.solve(self._joint, driven)[..., 0]
+        else:
+            forces = driven[..., 0] / self._joint[..., 0]
+        number = np.arange(-bays, bays + 1)
+        phase = np.exp(1j * np.pi * number / self.ring)
+        out = np.empty((len(self.omega), len(number), len(loads)), dtype=np.complex128)
+        for i, load in enumerate(loads):
+            field = np.zeros(self._joint.shape[:2], dtype=np.complex128)
+            for p, (at, _) in enumerate(self._pads):
+                field += sign * self._rail_comb(float(load) - at) * forces[..., p]
+            if own is not None and layer == "rail":
+                field += self._of(own, float(load) - place)
+            out[:, :, i] = np.fft.ifft(field, axis=1)[:, number] * phase
+        return out

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from solver import InputError, Scenario, Simulation, build_scenario
+from solver import InputError, Scenario, Simulation, build_scenario, local
 from solver.hybrid import crossover_frequency, interpolation_filters, line_speed
 from solver.irregularity import build_profile, spectrum
-from solver.local import LocalField, local_wheel, low_pass
+from solver.local import LAGS, LocalField, LocalLine, LocalWheel, local_wheel, low_pass
 from solver.motion import TrainMotion
 from solver.validation import compare_models
-from solver.waves import pinned_pinned_frequency
+from solver.waves import pinned_pinned_frequency, rail_beam
 
 SPEED = 300 / 3.6
 
@@ -106,75 +106,146 @@ def test_interpolation_of_the_global_set() -> None:
         np.testing.assert_allclose(found, exact, atol=1e-3)
 
 
+FRAME = 6.4e-3
+
+
 @pytest.fixture(scope="module")
-def field() -> LocalField:
-    return LocalField(scenario(), 1413.0, (2,))
+def line() -> LocalLine:
+    return LocalLine(scenario(), 1413.0, FRAME)
 
 
-def wheel_of(field: LocalField, irregularity: Any) -> Any:
+def wheel_of(line: LocalLine, irregularity: Any) -> LocalWheel:
     profile = build_profile(irregularity, -40.0, 60.0, 16.25)
     return local_wheel(
-        profile, field.waves, field.edges, SPEED, True, 2400.0, 2.65e9, field.scenario.line.length
+        profile,
+        line.cells,
+        line.waves.receptances,
+        line.edges,
+        0.65,
+        SPEED,
+        True,
+        2400.0,
+        2.65e9,
+        line.scenario.line.length,
     )
 
 
-def test_wheel_force_follows_the_spectrum(field: LocalField) -> None:
+def test_cells_tile_the_local_band(line: LocalLine) -> None:
+    cells = line.cells
+    np.testing.assert_allclose(cells.low[1:], cells.high[:-1])
+    assert cells.low[0] == pytest.approx(2 * np.pi * line.edges[0])
+    assert cells.high[-1] == pytest.approx(2 * np.pi * line.edges[-1])
+    # lines of frames of 12.8 ms
+    np.testing.assert_allclose(cells.line[1:-1] * 78.125 * 2 * np.pi, cells.centre[1:-1])
+    # inside, where frequencies are evenly spaced, the mean of a straight line is itself
+    straight = 3.0 + 2.0 * cells.omega
+    inside = slice(40, -40)
+    np.testing.assert_allclose(cells.smoothed(straight, 800.0)[inside], straight[inside], rtol=1e-9)
+
+
+def test_wheel_force_follows_the_spectrum(line: LocalLine) -> None:
     """F(x) against S_r |1/(alpha_w + 1/k_H + alpha_r)|^2 with an infinite-beam receptance.
 
     20 m at 1.4-5.7 kHz hold some 1000 waves: the rms of a realisation scatters by 2 %; the
     smooth receptance misses the pinned-pinned bands by a few per cent more.
     """
-    wheel = wheel_of(field, scenario().irregularity)
+    wheel = wheel_of(line, scenario().irregularity)
     x = np.linspace(-2.0, 18.0, 40001)
     found = np.mean(wheel.force(x) ** 2)
-    omega = np.linspace(2 * np.pi * field.edges[0], 2 * np.pi * field.edges[-1], 4000)
-    alpha = field.waves.periodic.beam.transfer_receptance(omega, 0.0)
+    omega = np.linspace(2 * np.pi * line.edges[0], 2 * np.pi * line.edges[-1], 4000)
+    alpha = rail_beam(scenario().track).transfer_receptance(omega, 0.0)
     gain = 1 / (alpha + 1 / 2.65e9 - 1 / (2400.0 * omega**2))
     density = spectrum(scenario().irregularity, omega / SPEED) / SPEED
     expected = np.trapezoid(density * np.abs(gain) ** 2, omega)
     assert np.sqrt(found / expected) == pytest.approx(1.0, abs=0.08)
 
 
-def test_a_moving_wheel_feeds_its_whole_power(field: LocalField) -> None:
-    """Mean over places of what enters the segments = <F^2> Re Y: the weights of a bay sum to one.
+def test_squares_of_the_cells_are_the_force_s(line: LocalLine) -> None:
+    """Mean over the line of the cells' sum against that of the force itself.
 
-    1e-3 is the midpoint rule over 200 places of a smooth function.
+    Cross terms of neighbouring bands and the ends of the smoothing are left out: 3 %.
     """
-    wheel = wheel_of(field, scenario().irregularity)
-    wheel.power[:] = 1.0
-    length = field._segment
-    fed = [
-        field.powers([wheel], np.array([x]))[1].sum(axis=0)
-        for x in 6 * length + (np.arange(200) + 0.5) / 200 * length
-    ]
-    np.testing.assert_allclose(np.mean(fed, axis=0), 1.0, rtol=1e-3)
+    wheel = wheel_of(line, scenario().irregularity)
+    x = np.arange(0.0, 16.25, 0.002)
+    total = wheel.square.sum(axis=1)
+    assert total.mean() == pytest.approx(np.mean(wheel.force(x) ** 2), rel=0.03)
 
 
-def test_balances_of_all_cells_close(field: LocalField) -> None:
+def test_a_moving_wheel_feeds_its_whole_power(line: LocalLine) -> None:
+    """Mean over the places of a segment of what enters on both sides is two, half of it each.
+
+    The segments are bays of 4 places and lose 0.35 of the energy: the trapezoidal rule over 4
+    points of exp(-0.35 x) is good to (0.35/4)^2/12 = 6e-4.
+    """
+    _, weight = line.injection(0.54)
+    inner = weight[8:88].reshape(-1, 4, 2).mean(axis=1).sum(axis=1)
+    np.testing.assert_allclose(inner, 2.0, rtol=7e-4)
+
+
+def test_balances_of_all_cells_close(line: LocalLine) -> None:
     """Reciprocity is checked on construction; energies are positive and losses equal the power."""
-    for cell in range(0, len(field.waves.decay), 3):
-        balance = field.balance(cell)
+    for cell in range(0, len(line.cells.line), 5):
+        balance = line.balance(cell)
         power = np.zeros(len(balance.loss))
-        power[[5, field.segments + 5]] = 0.5
+        power[[5, line.segments + 5]] = 0.5
         energy = balance.steady(power)
         assert energy.min() >= 0
         assert balance.dissipated(energy).sum() == pytest.approx(1.0, rel=1e-9)
 
 
+def test_channels_show_the_exact_direct_field_away_from_the_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On 80 m, without limit of age, the response summed over the lags is the direct field's.
+
+    Rail at mid-line, wheel within 10 m: what comes back from the ends has fallen by 2.2 dB/m over
+    60 m or more in the rail; slab and layer, which decay slower, bring 1e-4.
+    """
+    monkeypatch.setattr(local, "LIFETIME", np.inf)
+    long = scenario(
+        line={"approach_left": 80.6},
+        channel=[{"name": "r", "layer": "rail", "x": 40.0}],
+        solution={"frequency_limit": 2000.0},
+    )
+    prepared = LocalLine(long, 1413.0, FRAME)
+    near = np.abs(prepared.places - 40.0) < 10
+    total = prepared.tables().response.sum(axis=0)[near, :, 0]
+    np.testing.assert_allclose(total, prepared._shown()[near, :, 0], rtol=3e-4)
+
+
+def test_second_wave_fills_the_line() -> None:
+    """Above the rail's second cut-on (5 kHz) a wave is left that hardly decays: ends reflect it.
+
+    15 m from a wheel, where the main wave has fallen by 35 dB, the undamped wave that comes back
+    from either end of 72 m, and again, adds at least what passed directly.
+    """
+    long = scenario(
+        line={"approach_left": 72.15}, channel=[{"name": "r", "layer": "rail", "x": 36.0}]
+    )
+    prepared = LocalLine(long, 4500.0, FRAME)
+    cells = prepared.cells.centre > 2 * np.pi * 5120
+    assert (prepared.waves.second.mobility[cells] > 0).all()
+    assert (prepared.waves.second.mobility[prepared.cells.centre < 2 * np.pi * 4900] == 0).all()
+    at = np.flatnonzero(np.abs(np.abs(prepared.places - 36.0) - 15.0) < 1)
+    total = prepared.tables().response.sum(axis=0)[at][:, cells, 0].mean()
+    assert total > 2 * prepared._shown()[at][:, cells, 0].mean()
+
+
 def test_noise_has_the_energy_of_the_balance() -> None:
-    """Wheel at rest at 2 m: mean square of the signal = kernel sum times power, both channels.
+    """Wheel at rest at 2 m: mean square of the signal = response times force, both channels.
 
     T = 3.8 s of noise of an effective bandwidth B of about 1 kHz: 1/sqrt(B T) = 1.6 %, and 5 % is
     three times that.
     """
     field = LocalField(scenario(solution={"seed": 5}), 1413.0, (1,))
-    wheel = wheel_of(field, scenario().irregularity)
-    place = np.array([2.0])
-    signal = np.concatenate([field.next_frame([wheel], place)[:, 0] for _ in range(620)])
-    subsystems, power = field.powers([wheel], place)
-    kernel = field._kernels.sum(axis=0)[subsystems]
-    expected = np.einsum("knc,kn->c", kernel, power)
-    found = (signal[20 * field.hop :] ** 2).mean(axis=0)
+    line = LocalLine(scenario(), 1413.0, FRAME)
+    wheel = wheel_of(line, scenario().irregularity)
+    frames = [([wheel], np.array([2.0]))] * 660
+    signal = field.next_frames(frames)[:, 0]
+    place = round(2.0 / wheel.step)
+    response = field.tables.response.sum(axis=0)[place]
+    expected = response.T @ wheel.square[place]
+    found = (signal[LAGS[-1] * field.hop :] ** 2).mean(axis=0)
     np.testing.assert_allclose(found, expected, rtol=0.05)
 
 
@@ -220,13 +291,21 @@ def test_force_is_that_of_fe_and_nan_off_the_line() -> None:
     assert np.corrcoef(parts)[0, 1] > 0.99
 
 
+def test_valid_band_is_what_the_layer_resolves() -> None:
+    channels = [
+        {"name": name, "layer": name, "x": 8.0} for name in ("rail", "slab", "support_layer")
+    ]
+    band = Simulation(scenario(channel=channels)).quality.valid_band
+    assert band == {"rail": 5000.0, "slab": 5000.0, "support_layer": 2000.0}
+
+
 def test_line_speed_is_the_mean_on_the_line() -> None:
     assert line_speed(TrainMotion(scenario().train[0]), 16.25) == pytest.approx(SPEED)
 
 
 @pytest.mark.slow
 def test_hybrid_against_fe_over_eight_seeds() -> None:
-    """The stated targets, where they are reached; 3 dB at 10 m and 6 dB at 15 m instead of 1.5.
+    """The stated targets.
 
     Below 316 Hz the Sato spectrum (wavelengths to 0.25 m) excites nothing: those bands hold the
     passage over the fastenings only, far below the rest.
@@ -240,8 +319,7 @@ def test_hybrid_against_fe_over_eight_seeds() -> None:
     assert np.all(np.abs(found.force_rms - 1) < 0.03)
     assert np.all(np.abs(10 ** (found.force_level[local] / 20) - 1) < 0.10)
     assert np.all(found.displacement < 0.01)
-    for distance, limit in zip(found.envelope, (1.5, 1.5, 3.0, 6.0), strict=True):
-        assert np.all(np.abs(distance[excited]) < limit)
+    assert np.all(np.abs(found.envelope[:, excited]) < 1.5)
     assert found.hybrid.modes < found.fe.modes / 1.5
 
 

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from solver import SolverError, build_scenario, modes
+from solver import cache as storage
 from solver.line import assemble
 from solver.modes import build_modal_line, complex_modes, modal_line, real_modes, reduced_modes
 
@@ -241,7 +242,9 @@ NO_CHANNEL = {"channel": []}
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(modes.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "c"))
+    monkeypatch.setattr(
+        storage.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "c")
+    )
     return tmp_path / "c"
 
 
@@ -270,7 +273,7 @@ def test_cache_tells_lines_apart_and_survives_damage(cache):
 
 
 def test_cache_is_bounded(cache, monkeypatch):
-    monkeypatch.setattr(modes, "CACHE_BYTES", 1)
+    monkeypatch.setattr(storage, "CACHE_BYTES", 1)
     modal_line(small(**NO_CHANNEL))
     modal_line(small(**NO_CHANNEL, track={"mortar": {"stiffness": 5e8}}))
     assert len(list(cache.glob("line-*.npz"))) == 1
@@ -279,12 +282,14 @@ def test_cache_is_bounded(cache, monkeypatch):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
 def test_unwritable_cache_is_skipped(tmp_path, monkeypatch):
     (tmp_path / "c").mkdir(mode=0o500)
-    monkeypatch.setattr(modes.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "c"))
+    monkeypatch.setattr(
+        storage.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "c")
+    )
     assert modal_line(small(**NO_CHANNEL)).solved > 0
 
 
 def test_cache_in_an_impossible_place_is_skipped(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("not a folder")
     place = str(tmp_path / "file" / "c")
-    monkeypatch.setattr(modes.platformdirs, "user_cache_dir", lambda *_, **__: place)
+    monkeypatch.setattr(storage.platformdirs, "user_cache_dir", lambda *_, **__: place)
     assert modal_line(small(**NO_CHANNEL)).solved > 0

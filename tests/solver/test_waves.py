@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from solver import load_scenario
 from solver.errors import InputError
 from solver.waves import (
+    LayeredTrack,
     PeriodicRail,
     WaveBeam,
+    Waves,
     pinned_pinned_frequency,
     plate_beam,
     rail_beam,
@@ -147,25 +152,79 @@ def test_travelling_wave_carries_the_input_power_away() -> None:
             ],
             axis=0,
         )
-        model = power / (2 * mass * wave.energy_velocity) * np.exp(-wave.decay * distance)
+        speed = power * wave.transverse / (2 * mass * wave.energy_velocity)
+        model = speed * np.exp(-wave.decay * distance)
         np.testing.assert_allclose(10 * np.log10(exact / model), 0, atol=0.3)
 
 
-def test_pattern_of_the_bloch_wave_against_the_far_field() -> None:
-    """|v(x)|^2 within a bay relative to its mean, far from the load where one wave is left."""
-    rail = PeriodicRail.of_track(TRACK)
-    omega = 2 * np.pi * np.array([1600.0, 2500, 4000])
-    places = np.array([0.0, 0.325, 0.5])
-    wave = rail.travelling(omega, places)
-    far = 12 * rail.spacing
-    decay = np.exp(wave.decay[:, None] * places)
-    level = np.stack([np.abs(rail.receptance(omega, 0.1, far + x)) ** 2 for x in places], axis=-1)
-    samples = rail.load_positions(24)
-    mean = np.mean(
-        [
-            np.abs(rail.receptance(omega, 0.1, far + x)) ** 2 * np.exp(wave.decay * x)
-            for x in samples
-        ],
-        axis=0,
+def finite_row(
+    track: LayeredTrack, omega: float, layer: str, sensor: float, load: float, count: int = 321
+) -> complex:
+    """Second method: forces of ``count`` fastenings on infinite beams, solved as unknowns."""
+    one = np.array([omega])
+    rail, (slab, under) = track.rail_waves(one), track.plate_waves(one)
+
+    def field(waves: Waves, x: np.ndarray) -> np.ndarray:
+        powers = np.exp(-waves.exponent[0] * np.abs(x)[..., None])
+        return np.asarray((waves.amplitude[0] * powers).sum(axis=-1))
+
+    at = (np.arange(count) - count // 2 + 0.5) * track.spacing
+    pad = track.stiffness + 1j * omega * track.damping
+    between = at[:, None] - at
+    joint = field(rail, between) + field(slab, between) + np.eye(count) / pad
+    forces = np.linalg.solve(joint, field(rail, at - load))
+    if layer == "rail":
+        return complex(
+            field(rail, np.array([sensor - load]))[0] - field(rail, sensor - at) @ forces
+        )
+    return complex(field(slab if layer == "slab" else under, sensor - at) @ forces)
+
+
+@pytest.mark.parametrize("layer", ["rail", "slab", "support_layer"])
+def test_layered_track_against_a_row_of_fastenings(layer: Any) -> None:
+    """The ends of the row are 104 m away: what they miss is the slowest wave, of the support layer."""
+    track = LayeredTrack.of_track(TRACK, TRACK.bed_on_bridge)
+    omega = 2 * np.pi * np.array([1250.0, 1500.0, 2000.0, 4000.0])
+    place, load = 0.2, 0.45
+    found = track.solve(omega).transfer(layer, "motion", place, np.array([load]), 12)
+    for bay in (-12, -3, 0, 5):
+        for i, w in enumerate(omega):
+            expected = finite_row(track, float(w), layer, place, bay * track.spacing + load)
+            assert abs(found[i, 12 + bay, 0] / expected - 1) < 5e-3
+
+
+def test_fastening_force_of_the_layered_track_is_pad_stiffness_times_relative_motion() -> None:
+    track = LayeredTrack.of_track(TRACK, TRACK.bed_on_subgrade)
+    omega = 2 * np.pi * np.array([700.0, 1500.0, 3000.0])
+    solution, middle = track.solve(omega), track.spacing / 2
+    loads = np.array([0.1, 0.4])
+    force = solution.transfer("rail", "fastening_force", middle, loads, 4)
+    rail = solution.transfer("rail", "motion", middle, loads, 4)
+    slab = solution.transfer("slab", "motion", middle, loads, 4)
+    pad = (track.stiffness + 1j * omega * track.damping)[:, None, None]
+    np.testing.assert_allclose(force, pad * (rail - slab), rtol=1e-7)
+
+
+def test_strain_of_the_layered_track_is_the_curvature_of_the_slab() -> None:
+    """Second difference over 2 cm of the deflection, whose wave is at least 0.2 m long: 2 %."""
+    track = LayeredTrack.of_track(TRACK, TRACK.bed_on_subgrade)
+    omega = 2 * np.pi * np.array([700.0, 1500.0])
+    solution, h = track.solve(omega), 0.01
+    load = np.array([0.3])
+    curvature = solution.transfer("slab", "strain", 0.1, load, 3)
+    left, middle, right = (
+        solution.transfer("slab", "motion", x, load, 3) for x in (0.1 - h, 0.1, 0.1 + h)
     )
-    np.testing.assert_allclose(wave.pattern, level * decay / mean[:, None], rtol=1e-6)
+    difference = (left - 2 * middle + right) / h**2
+    # the source of a force on the slab is smooth at 0.1 m: its fastenings are 0.2 m away
+    assert np.abs(curvature / difference - 1).max() < 0.02
+
+
+def test_layered_track_on_a_heavy_slab_is_the_periodic_rail_on_rigid_ground() -> None:
+    track = LayeredTrack.of_track(TRACK, TRACK.bed_on_bridge)
+    heavy = replace(track, slab=WaveBeam(1e14, 1e12))
+    rail = PeriodicRail(track.rail, track.spacing, track.stiffness, track.damping)
+    found = heavy.solve(OMEGA[2:]).transfer("rail", "motion", 0.1, np.array([0.5]), 6)
+    for bay in (-6, 0, 3):
+        expected = rail.receptance(OMEGA[2:], 0.5 + bay * track.spacing, 0.1)
+        np.testing.assert_allclose(found[:, 6 + bay, 0], expected, rtol=1e-5)
