@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from sensor_msgs.msg import PointCloud2
 
 from solver import InputError
 from trackvib_ros import messages as m
 from trackvib_ros.detection import Channel, TrainEvent
-from trackvib_ros.intake import Intake
+from trackvib_ros.listening import Listening
 from trackvib_ros.outbox import Outbox
 from trackvib_ros.process import Stop, prepare, transition, value
 from trackvib_ros.recorder import Recorder
 from trackvib_ros.settings import DETECTOR_SETTINGS
-
-DRAIN_S = 0.7
-"""Time for blocks that have arrived but were not looked at when the node is deactivated (s)."""
 
 
 class DetectorNode(LifecycleNode):  # type: ignore[misc]
@@ -30,10 +26,9 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
     def __init__(self, stop: Stop, **arguments: Any) -> None:
         super().__init__("detector", **arguments)
         self.failure: str | None = None
-        self._intake: Intake | None = None
+        self._listening: Listening | None = None
         self._channels: dict[str, list[Channel]] = {}
         self._description: Any = None
-        self._inputs: list[tuple[str, Any]] = []
         self._recorder: Recorder | None = None
         self._outbox = Outbox(self)
         prepare(self, DETECTOR_SETTINGS)
@@ -44,23 +39,18 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
     @transition
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the channels, or wait for their description; create the bag."""
-        try:
-            names = value(self, "channel_names")
-            if names:
-                self._channels = m.channels_by_topic(
-                    names,
-                    value(self, "channel_positions"),
-                    value(self, "channel_layers"),
-                    value(self, "channel_topics"),
-                )
-            if value(self, "record_directory"):
-                directory = Path(value(self, "record_directory"))
-                self._recorder = Recorder(self, directory, use_sim_time=True)
-                self._recorder.start()
-        except (InputError, OSError) as failure:
-            self.failure = str(failure)
-            self.get_logger().error(self.failure)
-            return TransitionCallbackReturn.FAILURE
+        names = value(self, "channel_names")
+        if names:
+            self._channels = m.channels_by_topic(
+                names,
+                value(self, "channel_positions"),
+                value(self, "channel_layers"),
+                value(self, "channel_topics"),
+            )
+        if value(self, "record_directory"):
+            directory = Path(value(self, "record_directory"))
+            self._recorder = Recorder(self, directory, use_sim_time=True)
+            self._recorder.start()
         return super().on_configure(state)
 
     @transition
@@ -117,75 +107,34 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
         except InputError as failure:
             self.get_logger().error(str(failure))
             return
-        if self._intake is None or channels != self._channels:
+        if self._listening is None or channels != self._listening.channels:
             self._be_quiet()
-            self._channels = channels
             self._listen(channels)
 
-    def _be_quiet(self) -> None:
-        deadline = time.monotonic() + DRAIN_S
-        for topic, subscription in self._inputs:
-            self._drain(topic, subscription, deadline)
-            self.destroy_subscription(subscription)
-        self._inputs.clear()
-        if self._intake is not None:
-            self._publish(self._intake.finish())
-        self._intake = None
-
-    def _drain(self, topic: str, subscription: Any, deadline: float) -> None:
-        """Take what has arrived but was not called for yet, as long as there is time."""
-        with subscription.handle:
-            while taken := subscription.handle.take_message(subscription.msg_type, False):
-                if self._intake is not None:
-                    self._publish(self._intake.take(topic, taken[0]))
-                if time.monotonic() > deadline:
-                    self.get_logger().warning(f"ended before all blocks of {topic} were looked at")
-                    return
-
     def _listen(self, channels: dict[str, list[Channel]]) -> None:
-        self._intake = Intake(channels)
         qos = m.BEST_EFFORT_STREAM if value(self, "best_effort") else m.STREAM
-        for topic in channels:
+        self._listening = Listening(self, channels, qos, self._publish)
 
-            def take(message: PointCloud2, topic: str = topic) -> None:
-                if self._intake is not None:
-                    self._publish(self._intake.take(topic, message))
+    def _be_quiet(self) -> None:
+        if self._listening is not None:
+            self._listening.close()
+        self._listening = None
 
-            self._inputs.append((topic, self.create_subscription(PointCloud2, topic, take, qos)))
-
-    def _publish(self, events: list[TrainEvent]) -> None:
+    def _publish(self, events: Sequence[TrainEvent]) -> None:
         for event in events:
-            self._outbox.put(m.TRAIN_EVENTS, m.event_message(event))
-            occupied, speed = m.occupied_message(event), m.speed_message(event)
-            if occupied is not None:
-                self._outbox.put(m.TRAIN_OCCUPIED, occupied)
-            if speed is not None:
-                self._outbox.put(m.TRAIN_SPEED, speed)
+            for topic, message in m.event_messages(event):
+                self._outbox.put(topic, message)
         self._outbox.flush()
 
     def _report(self) -> None:
         components = []
-        if self._intake is not None:
-            silent = [topic for topic in self._channels if not self.count_publishers(topic)]
-            components.append(("input", *self._intake.state(silent)))
+        if self._listening is not None:
+            components.append(("input", *self._listening.state()))
         elif self._description is not None:
             components.append(("input", f"waiting for topic {m.CHANNELS.name}", {}))
         else:
             components.append(("input", None, {"state": "not active"}))
         if self._recorder is not None:
-            components.append(("recorder", *self._recorder_state(self._recorder)))
+            components.append(("recorder", *self._recorder.state()))
         stamp = self.get_clock().now().nanoseconds
         self._outbox.put(m.DIAGNOSTICS, m.diagnostics_message(stamp, self.get_name(), components))
-
-    def _recorder_state(self, recorder: Recorder) -> tuple[str | None, dict[str, object]]:
-        drops = {t: n for t, n in recorder.drops.items() if n and t != m.CLOCK.name}
-        lost = ", ".join(f"{n} of {topic}" for topic, n in drops.items())
-        warning = recorder.failure or (f"messages lost: {lost}" if drops else None)
-        counts = {f"recorded {topic}": n for topic, n in recorder.counts.items()}
-        failure = recorder.failure or ""
-        return warning, {
-            "bag": recorder.directory,
-            "lost": sum(drops.values()),
-            "failure": failure,
-            **counts,
-        }

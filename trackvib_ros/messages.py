@@ -233,6 +233,16 @@ def read_events(message: DiagnosticArray) -> list[TrainEvent]:
     return [TrainEvent.from_dict(values) for values in _statuses(message)]
 
 
+def event_messages(event: TrainEvent) -> list[tuple[Topic, object]]:
+    """All that an event says, by topic."""
+    messages = [
+        (TRAIN_EVENTS, event_message(event)),
+        (TRAIN_OCCUPIED, occupied_message(event)),
+        (TRAIN_SPEED, speed_message(event)),
+    ]
+    return [(topic, message) for topic, message in messages if message is not None]
+
+
 def speed_message(event: TrainEvent) -> TwistWithCovarianceStamped | None:
     """The velocity along x of the line that an event states, with its variance, if it does.
 

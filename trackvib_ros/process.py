@@ -31,6 +31,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+
+from solver import InputError, SolverError
 
 RCLError = rclpy_implementation.RCLError
 
@@ -172,16 +175,47 @@ def value(node: Node, name: str) -> Any:
         return None
 
 
+def offer(node: Node, *commands: Callable[[], str]) -> None:
+    """A service ``~/<name>`` (std_srvs/Trigger) for each method: answers what it says, or why not.
+
+    The name is the method's without the underscore in front.
+    """
+
+    def service(command: Callable[[], str]) -> Callable[[Any, Any], Any]:
+        def answer(_request: Any, response: Any) -> Any:
+            try:
+                response.message, response.success = command(), True
+            except (InputError, SolverError) as failure:
+                response.message = str(failure)
+            except Interrupted:
+                response.message = "the process is ending"
+            return response
+
+        return answer
+
+    for command in commands:
+        node.create_service(Trigger, f"~/{command.__name__.lstrip('_')}", service(command))
+
+
 Transition = Callable[[Any, LifecycleState], TransitionCallbackReturn]
 
 
 def transition(callback: Transition) -> Transition:
-    """A lifecycle callback whose unforeseen errors are told; rclpy alone swallows them."""
+    """A lifecycle callback that fails when it raises for a user's mistake, and says why.
+
+    Unforeseen errors are told too; rclpy alone swallows them.
+    """
 
     @functools.wraps(callback)
     def told(node: Any, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return callback(node, state)
+        except Interrupted:
+            return TransitionCallbackReturn.FAILURE
+        except (InputError, SolverError, OSError) as failure:
+            node.failure = str(failure)
+            node.get_logger().error(node.failure)
+            return TransitionCallbackReturn.FAILURE
         except Exception as error:
             node.failure = f"{callback.__name__}: {error!r}"
             node.get_logger().error(traceback.format_exc())

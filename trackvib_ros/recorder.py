@@ -166,6 +166,17 @@ class Recorder:
         total = Counter(dict(self._writer.drops)) + self._lost
         return dict(total)
 
+    def state(self) -> tuple[str | None, dict[str, object]]:
+        """Warning, if any, and figures for diagnostics."""
+        drops = {topic: n for topic, n in self.drops.items() if n and topic != CLOCK}
+        lost = ", ".join(f"{n} of {topic}" for topic, n in drops.items())
+        return self.failure or (f"messages lost: {lost}" if drops else None), {
+            "bag": self.directory,
+            "lost": sum(drops.values()),
+            "failure": self.failure or "",
+            **{f"recorded {topic}": n for topic, n in self.counts.items()},
+        }
+
     @property
     def topics(self) -> tuple[str, ...]:
         """Topics subscribed for recording."""

@@ -24,6 +24,11 @@ HURRY_S = 0.5
 Component = tuple[str, str | None, Mapping[str, object]]
 
 
+def without_run(failure: str | None) -> list[Component]:
+    """What ``/diagnostics`` says while there is no run."""
+    return [("simulation", failure, {"state": "not configured"})]
+
+
 class Run:
     """Publishes a station step by step.
 
@@ -31,17 +36,20 @@ class Run:
         node: publishers and clock become this node's.
         station: what runs.
         truth: whether ``ground_truth/...`` is published.
+        detectors, recorders: subscriptions to wait for before the first step: both on waveform
+            topics, recorders on every data topic.
 
     Attributes:
         pace: its factor may be changed at any time.
-        detectors, recorders: subscriptions to wait for before the first step: both on waveform
-            topics, recorders on every data topic.
+        station: what runs.
     """
 
-    def __init__(self, node: Node, station: Station, truth: bool) -> None:
+    def __init__(
+        self, node: Node, station: Station, *, truth: bool, detectors: int, recorders: int
+    ) -> None:
         self.pace = Pace(1.0)
-        self.detectors = self.recorders = 0
         self.station = station
+        self._detectors, self._recorders = detectors, recorders
         self._truth = truth
         self._outbox = Outbox(node)
         self._clock = SimulationClock(node)
@@ -153,7 +161,7 @@ class Run:
     def _subscribed(self) -> bool:
         counts = self._outbox.subscriptions()
         return all(
-            count >= self.recorders + (self.detectors if name in self._waveforms else 0)
+            count >= self._recorders + (self._detectors if name in self._waveforms else 0)
             for name, count in counts.items()
         )
 

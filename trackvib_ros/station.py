@@ -77,6 +77,11 @@ def reseeded(scenario: Scenario, seed: int) -> Scenario:
     )
 
 
+def next_seed(scenario: Scenario, wanted: int) -> int:
+    """The seed of a run that follows: as wanted, or if that is negative the scenario's and one."""
+    return scenario.irregularity.seed + 1 if wanted < 0 else wanted
+
+
 class Station:
     """A scenario that runs step by step.
 
