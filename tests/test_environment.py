@@ -77,6 +77,7 @@ def test_pace_follows_the_wall_and_gives_up_what_is_lost() -> None:
     wall[0] = 100.9
     assert pace.delay(11_000_000_000) == 0.0  # late by 0.4 s: caught up
     assert pace.late_s == 0.0
+    assert pace.behind_s == pytest.approx(0.4)
     wall[0] = 105.0
     assert pace.delay(11_200_000_000) == 0.0  # late by 4.4 s: given up
     assert pace.late_s == pytest.approx(4.4)

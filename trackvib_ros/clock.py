@@ -27,11 +27,13 @@ class Pace:
 
     Attributes:
         late_s: wall time given up so far because the run could not keep pace (s).
+        behind_s: longest time by which a step began late; whoever reads it may set it to 0 (s).
     """
 
     def __init__(self, factor: float, now: Callable[[], float] = time.monotonic) -> None:
         self.factor = factor
         self.late_s = 0.0
+        self.behind_s = 0.0
         self._now = now
         self._origin: tuple[float, int] | None = None
 
@@ -48,6 +50,7 @@ class Pace:
             self._origin = (now, time_ns)
         wall, simulated_ns = self._origin
         due = wall + (time_ns - simulated_ns) * 1e-9 / self.factor
+        self.behind_s = max(self.behind_s, now - due)
         if now - due > LAG_LIMIT_S:
             self.late_s += now - due
             self._origin = (now, time_ns)

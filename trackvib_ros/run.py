@@ -204,6 +204,7 @@ class Run:
         wall, since_ns = self._measured
         self._measured = (now, time_ns)
         wall_s, self._wall_s = self._wall_s, 0.0
+        behind_s, self.pace.behind_s = self.pace.behind_s, 0.0
         simulated_s = (time_ns - since_ns) * 1e-9
         quality = self.station.simulation.quality
         subscriptions = self._outbox.subscriptions()
@@ -225,6 +226,7 @@ class Run:
                     "real_time_factor": round(simulated_s / (now - wall), 3),
                     "wall_per_simulated": round(wall_s / simulated_s, 4) if simulated_s else 0.0,
                     "late_s": round(self.pace.late_s, 3),
+                    "behind_s": round(behind_s, 4),
                     "lost_contacts": quality.lost_contacts,
                     "equilibrium_residual": f"{quality.equilibrium_residual:.3g}",
                 },
