@@ -73,6 +73,9 @@ class BeamSection:
         return math.sqrt(w2) / (2 * math.pi)
 
 
+ORTHONORMALITY = 1e-6
+"""Largest entry of the functions' mass matrix beside the unit matrix; grows with their number."""
+
 RESIDUAL_FROM = 2
 """Hierarchical functions that are modes before residual vectors are added."""
 
@@ -233,6 +236,13 @@ def _euler_bernoulli(length: float, section: BeamSection, n: int) -> Element:
     squared = np.zeros(0)
     if n:
         squared, vectors = scipy.linalg.eigh(stiff, mass)
+        miss = float(np.abs(vectors.T @ mass @ vectors - np.eye(n)).max())
+        if miss > ORTHONORMALITY:
+            raise SolverError(
+                f"beam element of {length:g} m: its {n} hierarchical functions are orthonormal "
+                f"within {miss:.3g}; limit {ORTHONORMALITY:g}: the basis is ill-conditioned, use "
+                "fewer"
+            )
         coefficients[:, 4:] = reduce @ vectors
     return Element(length, "sines", coefficients, None, np.sqrt(squared) / (2 * np.pi))
 

@@ -985,7 +985,8 @@ class ModalRun:
             bad |= ~np.isfinite(self._fleet.force)
             if bad.any():
                 axle = int(np.argmax(bad))
-                value = np.nanmax(np.abs(np.append(force[:, axle], self._fleet.force[axle])))
+                forces = np.append(force[:, axle], self._fleet.force[axle])
+                value = float(np.fmax.reduce(np.abs(forces)))
                 raise SolverError(
                     f"force of a wheelset = {value:.3g} N before t = {time[-1]:.6g} s; limit "
                     f"{limit[axle]:.3g} N: the run diverged, shorten solution.step"

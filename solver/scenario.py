@@ -492,6 +492,9 @@ class Sensor(Section):
     seed: int = _quantity("-", "seed of noise, jitter and drop-outs", ge=0, default=1)
 
 
+Sines = Annotated[int, Field(ge=0, le=1000)]
+
+
 class Solution(Section):
     """How the run is computed."""
 
@@ -519,7 +522,7 @@ class Solution(Section):
         gt=0,
         default=None,
     )
-    sines: tuple[int, int, int, int] | None = Field(
+    sines: tuple[Sines, Sines, Sines, Sines] | None = Field(
         default=None,
         description="hierarchical functions per element of rail, slab, support layer, bridge; "
         "unset: chosen from the frequency limit; only with an Euler-Bernoulli rail",
@@ -770,6 +773,8 @@ def _explain(error: ValidationError, source: str) -> InputError:
             rule = rule[0].lower() + rule[1:]
         value = item["input"]
         shown = "" if isinstance(value, (Mapping, BaseModel)) else f" = {value!r}"
+        if len(shown) > 100 and isinstance(value, (list, tuple)):
+            shown = f" of {len(value)} entries"
         if shown and unit not in ("", "-"):
             shown += f" {unit}"
         lines.append(f"{where}{shown}: {rule}")

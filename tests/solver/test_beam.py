@@ -9,6 +9,7 @@ import pytest
 import scipy.linalg
 import scipy.optimize
 
+from solver import SolverError
 from solver.beam import BeamSection, beam_element
 from solver.line import beam_field, beam_matrices
 
@@ -258,3 +259,8 @@ def test_wavenumber_and_frequency_are_inverse():
         assert section.frequency(np.pi / 0.65) == pytest.approx(
             pinned_closed_form(section, 0.65, 1), rel=1e-10
         )
+
+
+def test_an_ill_conditioned_basis_is_refused():
+    with pytest.raises(SolverError, match=r"900 hierarchical functions .*limit 1e-06"):
+        beam_element(32.0, EULER, 900)

@@ -96,6 +96,11 @@ def test_speed_in_km_per_h_is_metres_per_second() -> None:
         (LINE + "[track.slab]\nthickness = nan\n", ["track.slab.thickness", "nan m", "finite"]),
         (LINE + "[contact]\nlaw = 'rigid'\n", ["contact.law", "rigid", "hertz"]),
         (
+            LINE + '[[train]]\nvehicles = [{ preset = "CRH3", count = 64 }, { preset = "CRH3" }]\nspeed = 80.0\nstart = 0.0\n',
+            ["train[0].vehicles of 65 entries", "at most 64"],
+        ),
+        (LINE + "[solution]\nsines = [-1, 1, 1, 1]\n", ["solution.sines[0]", "-1", "greater than or equal"]),
+        (
             LINE + "[solution]\nsines = [31, 31, 31, 8]\n",
             ["solution.sines = [31, 31, 31, 8]", "kink at every fastening", "euler_bernoulli"],
         ),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closed_forms import LENGTH, MASS, beam_line, damping_ratios, frequencies
 
-from solver import InputError, Simulation, build_scenario, check_run
+from solver import InputError, Simulation, SolverError, build_scenario, check_run
 from solver.modal import ModalRun
 from solver.modes import modal_line
 from solver.proofs import rolling_weight
@@ -284,6 +284,30 @@ def test_check_run_names_every_quantity_and_shrinks_with_the_step():
 def test_wrong_scenarios_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         Simulation(build_scenario(table(**changes))).advance(1)
+
+
+@pytest.mark.parametrize("integrator", ["exponential", "newmark"])
+def test_divergence_is_a_typed_error_and_no_nan_comes_out(integrator):
+    """A state that is not finite, put in by hand: no step that is accepted diverges by itself."""
+    solution = {"integrator": integrator, "step": 2e-4}
+    simulation = Simulation(build_scenario(table(solution=solution)))
+    simulation.advance(20)
+    run = simulation._run
+    if integrator == "newmark":
+        run._line.u[3] = np.nan
+    else:
+        run._modal.ravel()[3] = np.nan
+    with pytest.raises(SolverError, match=r" = nan N before|change by nan N after"):
+        simulation.advance(20)
+
+
+def test_a_wheel_force_beyond_all_bounds_is_a_typed_error(monkeypatch):
+    monkeypatch.setattr("solver.modal.FORCE_LIMIT", 1e-2)
+    simulation = Simulation(build_scenario(table()))
+    with pytest.raises(
+        SolverError, match=r"force of a wheelset = .* N before t = .*; limit 1\.\d+e\+03 N"
+    ):
+        simulation.advance(20)
 
 
 def test_a_train_out_of_nowhere_is_refused():
