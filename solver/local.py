@@ -646,7 +646,9 @@ class LocalLine:
 
 def local_cells(scenario: Scenario, crossover: float, frame: float) -> tuple[Real, Cells]:
     """Edges (Hz) of the local bands, and cells as wide as frames of 2 ``frame`` (s) part them."""
-    edges = band_edges(crossover, BAND_MARGIN * scenario.solution.frequency_limit)
+    nyquist = 0.5 / scenario.solution.step  # its line is no part of the spectrum
+    highest = min(BAND_MARGIN * scenario.solution.frequency_limit, nyquist - 0.25 / frame)
+    edges = band_edges(crossover, highest)
     return edges, Cells.between(edges, 0.5 / frame)
 
 
