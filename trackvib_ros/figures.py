@@ -23,8 +23,8 @@ from solver import (
 Array = NDArray[np.float64]
 Signal = Literal["displacement", "velocity", "acceleration"]
 
-SEEDS = range(1, 9)
-"""Roughness realisations over which the spectrum of Fig. 8 is averaged."""
+REALISATIONS = 40
+"""Of the roughness, for the mean spectrum of Fig. 8: 8 do not decide its highest peak."""
 
 RESOLUTION = 25.0
 """Bandwidth (Hz) of the smoothed spectrum of Fig. 8."""
@@ -104,7 +104,7 @@ def run(scenario: Scenario) -> Passage:
 
 
 def spectrum(passages: list[Passage], channel: str) -> tuple[Array, Array]:
-    """Mean power spectral density of velocity (m²/s²/Hz), smoothed over RESOLUTION: f (Hz), PSD."""
+    """Frequency (Hz) and mean power spectral density of velocity (m²/s²/Hz), smoothed."""
     first = passages[0]
     step, n = float(first.time[1] - first.time[0]), len(first.time)
     window = np.hanning(n)
@@ -115,9 +115,9 @@ def spectrum(passages: list[Passage], channel: str) -> tuple[Array, Array]:
     return frequency, np.convolve(density, np.ones(width) / width, "same")
 
 
-def highest(frequency: Array, density: Array, above: float) -> float:
-    """Frequency (Hz) of the largest value above a frequency (Hz)."""
-    inside = frequency > above
+def highest(frequency: Array, density: Array, above: float, below: float) -> float:
+    """Frequency (Hz) of the largest value between two frequencies (Hz)."""
+    inside = (frequency > above) & (frequency < below)
     return float(frequency[inside][np.argmax(density[inside])])
 
 
@@ -147,10 +147,13 @@ class Study:
     seeds: list[Passage]
 
 
-def study() -> Study:
+def study(realisations: int = REALISATIONS) -> Study:
     """Run the example: as printed (hybrid, and its global set alone) and resolved to 5 kHz."""
     scenario = load_scenario("paper")
-    resolved = [run(variant(scenario, "fe", resolved=True, seed=seed)) for seed in SEEDS]
+    resolved = [
+        run(variant(scenario, "fe", resolved=True, seed=seed))
+        for seed in range(1, realisations + 1)
+    ]
     return Study(
         scenario,
         run(scenario),
@@ -172,9 +175,11 @@ def claims(found: Study) -> list[Claim]:
     deep = {name: 1e3 * float(np.abs(u).max()) for name, u in full.displacement.items()}
     frequency, density = spectrum(found.seeds, "rail_mid")
     _, hybrid_density = spectrum([found.hybrid], "rail_mid")
-    top = highest(frequency, density, 500)
-    upper = highest(frequency, density, 1000)
-    hybrid_upper = highest(frequency, hybrid_density, 1000)
+    top = highest(frequency, density, 500, 5000)
+    far = np.where(np.abs(frequency / top - 1) > 0.1, density, 0.0)
+    second = highest(frequency, far, 500, 5000)
+    lead = 10 * np.log10(density[frequency == top].item() / density[frequency == second].item())
+    hybrid_upper = highest(frequency, hybrid_density, 1000, 5000)
     middle = line.length / 2
     falls = {name: fall(full, name, middle) for name in full.acceleration}
     sines = scenario.solution.sines
@@ -205,6 +210,13 @@ def claims(found: Study) -> list[Claim]:
             f"{peak['support_layer_mid']:.1f}, bridge {peak['bridge_mid']:.2f} m/s² to 5 kHz",
         ),
         Claim(
+            "(1) type, arrival, passing, departure and speed follow from the accelerations of rail "
+            "and bridge",
+            "of the rail: yes (`trackvib demo`); one wheel element has no type. "
+            "Of the bridge: its displacement peaks once per passage, its acceleration shows no "
+            "wheels, as (2) says itself; it gives presence, neither axles nor speed",
+        ),
+        Claim(
             "(1), (2): wheels can be told in the rail, not in track slab and girder",
             f"level at the wheel over level 10 m away: rail {falls['rail_mid']:.0f} dB, slab "
             f"{falls['slab_mid']:.0f} dB, support layer {falls['support_layer_mid']:.0f} dB, "
@@ -212,10 +224,11 @@ def claims(found: Study) -> list[Claim]:
         ),
         Claim(
             "(2) Fig. 8: PSD of rail speed largest at about 1400 Hz, the rail's first frequency",
-            f"pinned-pinned frequency {pinned_pinned_frequency(track):.0f} Hz; mean of "
-            f"{len(found.seeds)} realisations: highest above 500 Hz at {top:.0f} Hz, above "
-            f"1 kHz at {upper:.0f} Hz; with 31 sines (hybrid, one realisation) above 1 kHz at "
-            f"{hybrid_upper:.0f} Hz",
+            f"pinned-pinned frequency {pinned_pinned_frequency(track):.0f} Hz. Mean of "
+            f"{len(found.seeds)} realisations in bands of {RESOLUTION:.0f} Hz: above 500 Hz "
+            f"highest at {top:.0f} Hz, {lead:.1f} dB over the next at {second:.0f} Hz; single "
+            "realisations may have it elsewhere. Below 500 Hz the passage itself is higher. With "
+            f"31 sines (hybrid, one realisation) highest above 1 kHz at {hybrid_upper:.0f} Hz",
         ),
         Claim(
             "35 rail degrees of freedom are the global set up to 3000 Hz",
@@ -239,6 +252,16 @@ def claims(found: Study) -> list[Claim]:
         Claim(
             "Eq. (10): -i pi omega³/2 n <j²>; the local modes damp the global ones",
             "subtracted in Eq. (5), with exp(+i omega t): D_gg gains +i pi omega³/2 n <j²>",
+        ),
+        Claim(
+            'power input is estimated from "Eq. 14", which is not printed',
+            "Eq. (13) is meant. It is zero here: the local modes are orthogonal to the global set "
+            "of complex modes, and all power is what the wheel puts in directly",
+        ),
+        Claim(
+            "the three classes of local modes in the time domain",
+            "not run: this example has the global set and, above it, energies in rail segments; "
+            "the classes are in solver/statistics.py, over frequency, 1 to 13 dB low in |w|²",
         ),
         Claim(
             "(3) the hybrid has fewer degrees of freedom and is efficient",
@@ -314,7 +337,7 @@ def draw(found: Study, folder: Path) -> list[Path]:
         )
     frequency, density = spectrum(found.seeds, "rail_mid")
     _, one = spectrum([hybrid], "rail_mid")
-    peak = highest(frequency, density, 1000)
+    peak = highest(frequency, density, 500, 5000)
     figure, axes = plt.subplots(figsize=(8, 4.2), layout="constrained")
     axes.semilogy(
         frequency, density, color="0.3", lw=1, label=f"{named[1]}, {len(found.seeds)} realisations"
@@ -331,7 +354,7 @@ def draw(found: Study, folder: Path) -> list[Path]:
     axes.grid(alpha=0.3)
     figure.suptitle(
         f"Fig. 8  PSD of mid-span rail velocity, {RESOLUTION:.0f} Hz bandwidth: highest above "
-        f"1 kHz at {peak:.0f} Hz; pinned-pinned {pinned_pinned_frequency(scenario.track):.0f} Hz",
+        f"500 Hz at {peak:.0f} Hz; pinned-pinned {pinned_pinned_frequency(scenario.track):.0f} Hz",
         fontsize=9,
     )
     figure.savefig(paths[5], dpi=150)

@@ -12,7 +12,7 @@ def test_the_papers_figures_are_drawn_into_a_new_folder_and_never_over_files(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "new" / "figures"
-    found = study()
+    found = study(2)
     paths = draw(found, folder)
     assert [path.stem for path in paths] == [*FIGURES, "claims"]
     for path in paths[:-1]:
