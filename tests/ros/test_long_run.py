@@ -1,6 +1,7 @@
 """An hour of random traffic at full speed, recorded: nothing lost, memory and cost flat.
 
 ``pytest -m slow -s tests/ros/test_long_run.py`` prints the curve. TRACKVIB_LONG_RUN_S: its length.
+The lead is told by diagnostics that are up to a second old, which adds what was published meanwhile.
 """
 
 from __future__ import annotations
