@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -662,20 +661,32 @@ def local_tables(scenario: Scenario, crossover: float, frame: float) -> LocalTab
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _sum_squares(
-    response: Real,
+    response: NDArray[np.float32],
     first: NDArray[np.intp],
-    lag: NDArray[np.intp],
+    middle: NDArray[np.intp],
+    kind: NDArray[np.intp],
     place: NDArray[np.intp],
     square: Real,
     total: Real,
 ) -> None:
-    """total (N, C) = sum over wheels of response (lags, P, N, C) times their squares (E, N)."""
-    total[:] = 0.0
-    for e in range(lag.size):
-        table = response[lag[e], place[e]]
-        for n in range(first[lag[e]], total.shape[0]):
-            for c in range(total.shape[1]):
-                total[n, c] += table[n, c] * square[e, n]
+    """total (M, N, C): response (lags, P, N, C) times the wheels' squares (K, P, N), summed.
+
+    kind, place: (H + M, W) of the wheels in H past and M new frames, kind -1 for none; middle:
+    (lags,) the past frame that speaks for a group.
+    """
+    past = kind.shape[0] - total.shape[0]
+    for m in range(total.shape[0]):
+        for lag in range(middle.size):
+            row = past + m - middle[lag]
+            for w in range(kind.shape[1]):
+                if kind[row, w] < 0:
+                    continue
+                at = place[row, w]
+                own = square[kind[row, w], at]
+                table = response[lag, at]
+                for n in range(first[lag], total.shape[1]):
+                    for c in range(total.shape[2]):
+                        total[m, n, c] += table[n, c] * own[n]
 
 
 class LocalField:
@@ -703,8 +714,12 @@ class LocalField:
         count = int(self.heard.sum())
         seeds = np.random.SeedSequence(solution.seed).spawn(count)
         self._random = [np.random.default_rng(seed) for seed in seeds]
-        # places and squares of the wheels of past frames, newest first
-        self._past: deque[tuple[NDArray[np.intp], Real]] = deque(maxlen=LAGS[-1])
+        self._middles = np.array([(a + b - 1) // 2 for a, b in itertools.pairwise(LAGS)])
+        # kind and place of the wheels in past frames, oldest first
+        self._kind = np.full((int(self._middles[-1]), 0), -1, dtype=np.intp)
+        self._place = np.zeros_like(self._kind)
+        self._wheels: list[LocalWheel] = []
+        self._squares = np.zeros((0, self.tables.response.shape[1], len(self.cells.line)))
         omega = self.cells.line * np.pi / self.frame
         self._factors: Complex = np.array([(1j * omega) ** (d - 1) for d in derivatives])
         self._window = np.sin(np.pi * (np.arange(2 * self.hop) + 0.5) / (2 * self.hop))
@@ -716,53 +731,65 @@ class LocalField:
         """Time step of the power balance (s)."""
         return float(self.hop * self.step)
 
-    def mean_square(self, wheels: Sequence[LocalWheel], places: Real) -> Real:
-        """Mean square velocity at the heard channels in the next frame, (N, C).
+    def use(self, wheels: list[LocalWheel]) -> None:
+        """Wheels that may be on the line from now on; others are forgotten."""
+        number = {id(wheel): i for i, wheel in enumerate(wheels)}
+        kept = np.array([number.get(id(wheel), -1) for wheel in self._wheels] + [-1], dtype=np.intp)
+        self._kind = kept[self._kind]
+        self._wheels = wheels
+        self._squares = np.array([wheel.square for wheel in wheels]).reshape(
+            len(wheels), *self._squares.shape[1:]
+        )
+
+    def mean_squares(self, kind: NDArray[np.intp], place: Real) -> Real:
+        """Mean square velocity at the heard channels in the next frames, (M, N, C).
 
         Args:
-            wheels: those on the line, places: (m) in the middle of the frame.
+            kind: (M, W) index into the wheels in use, -1 off the line. place: (M, W) m.
         """
         last = self.tables.response.shape[1] - 1
-        index = np.zeros(len(wheels), dtype=np.intp)
-        square = np.zeros((len(wheels), len(self.cells.line)))
-        for i, wheel in enumerate(wheels):
-            index[i] = min(max(round(float(places[i]) / wheel.step), 0), last)
-            square[i] = wheel.square[index[i]]
-        self._past.appendleft((index, square))
-        middles = [(begin + end - 1) // 2 for begin, end in itertools.pairwise(LAGS)]
-        chosen = [(lag, self._past[m]) for lag, m in enumerate(middles) if m < len(self._past)]
-        lags = np.concatenate([np.full(len(part[0]), lag) for lag, part in chosen])
-        total = np.zeros((square.shape[1], len(self._random)))
+        step = self._wheels[0].step if self._wheels else 1.0
+        at = np.clip(np.rint(place / step), 0, last).astype(np.intp)
+        width = max(kind.shape[1], self._kind.shape[1])
+
+        def joined(past: NDArray[np.intp], new: NDArray[np.intp]) -> NDArray[np.intp]:
+            parts = np.full((len(past) + len(new), width), -1, dtype=np.intp)
+            parts[: len(past), : past.shape[1]] = past
+            parts[len(past) :, : new.shape[1]] = new
+            return parts
+
+        kinds, places = joined(self._kind, kind), joined(self._place, at)
+        total = np.zeros((len(kind), len(self.cells.line), len(self._random)))
+        tables = self.tables
         _sum_squares(
-            self.tables.response,
-            self.tables.first,
-            lags,
-            np.concatenate([part[0] for _, part in chosen]),
-            np.concatenate([part[1] for _, part in chosen]),
-            total,
+            tables.response, tables.first, self._middles, kinds, places, self._squares, total
         )
+        # columns of trains that have left stay while the past tells of them
+        used = np.any(kinds[len(kind) :] >= 0, axis=0)
+        self._kind, self._place = kinds[len(kind) :, used], places[len(kind) :, used]
         return total
 
-    def next_frames(self, frames: Sequence[tuple[Sequence[LocalWheel], Real]]) -> Real:
-        """Local channel signals of the next frames, (frames * hop, D, C).
+    def next_frames(self, kind: NDArray[np.intp], place: Real) -> Real:
+        """Local channel signals of the next frames, (M * hop, D, C).
 
         Args:
-            frames: wheels on the line and their places (m) in the middle of every frame.
+            kind: (M, W) index into the wheels in use, -1 off the line, in the middle of frames.
+            place: (M, W) m.
         """
-        count, channels, derivatives = len(frames), len(self._random), len(self._factors)
+        count, channels, derivatives = len(kind), len(self._random), len(self._factors)
         out = np.zeros((count + 1, self.hop, derivatives, channels))
         out[0] = self._overlap
         if not channels:
             return out[:-1].reshape(-1, derivatives, channels)
-        sounding, squares = [], []
-        for number, (wheels, places) in enumerate(frames):
-            self._quiet = 0 if len(wheels) else self._quiet + 1
+        sounding = []
+        for number, present in enumerate(np.any(kind >= 0, axis=1).tolist()):
+            self._quiet = 0 if present else self._quiet + 1
             if self._quiet <= LAGS[-1]:
                 sounding.append(number)
-                squares.append(self.mean_square(wheels, places))
+        squares = self.mean_squares(kind, place)[sounding]
         if sounding:
             # irfft of N lines has the variance 2/N^2 sum <|X|^2>, and <|X|^2> = 2 level^2
-            level = np.sqrt(np.stack(squares)).transpose(2, 0, 1) * self.hop  # (C, frames, N)
+            level = np.sqrt(squares).transpose(2, 0, 1) * self.hop  # (C, frames, N)
             lines = self.cells.line
             drawn = np.empty(level.shape, dtype=np.complex128)
             for c, random in enumerate(self._random):
@@ -770,11 +797,11 @@ class LocalField:
                 drawn[c] = level[c] * (draw[:, 0] + 1j * draw[:, 1])
             spectrum = np.zeros((*level.shape[:2], self.hop + 1), dtype=np.complex128)
             for d, factor in enumerate(self._factors):
-                spectrum[:, :, lines] = drawn * factor
+                spectrum[:, :, lines[0] : lines[-1] + 1] = drawn * factor
                 signal = scipy.fft.irfft(spectrum, 2 * self.hop, axis=2) * self._window
-                for i, number in enumerate(sounding):
-                    out[number, :, d] += signal[:, i, : self.hop].T
-                    out[number + 1, :, d] += signal[:, i, self.hop :].T
+                signal = signal.transpose(1, 2, 0)
+                out[sounding, :, d] += signal[:, : self.hop]
+                out[np.array(sounding) + 1, :, d] += signal[:, self.hop :]
         self._overlap = out[-1].copy()
         return out[:-1].reshape(-1, derivatives, channels)
 

@@ -41,6 +41,8 @@ class TrainMotion:
     def travelled(self, time: ArrayLike) -> Array:
         """Distance run since ``start_time`` (m), negative before it; shape of ``time`` (s)."""
         t = np.asarray(time, dtype=np.float64)
+        if len(self._knots) == 1:
+            return np.asarray(self._speeds[0] * (t - self._knots[0]))
         piece = np.clip(np.searchsorted(self._knots, t, side="right") - 1, 0, None)
         elapsed = t - self._knots[piece]
         rate = np.where(elapsed < 0, 0.0, self._rates[piece])

@@ -240,8 +240,8 @@ def test_noise_has_the_energy_of_the_balance() -> None:
     field = LocalField(scenario(solution={"seed": 5}), 1413.0, (1,))
     line = LocalLine(scenario(), 1413.0, FRAME)
     wheel = wheel_of(line, scenario().irregularity)
-    frames = [([wheel], np.array([2.0]))] * 660
-    signal = field.next_frames(frames)[:, 0]
+    field.use([wheel])
+    signal = field.next_frames(np.zeros((660, 1), dtype=np.intp), np.full((660, 1), 2.0))[:, 0]
     place = round(2.0 / wheel.step)
     response = field.tables.response.sum(axis=0)[place]
     expected = response.T @ wheel.square[place]
