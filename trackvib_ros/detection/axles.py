@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from .kinematics import POSITION_SIGMA, Fit, Motion, regress
+from .kinematics import HIGH_BAND_POSITION_SIGMA, POSITION_SIGMA, Fit, Motion, regress
 from .pattern import Trace
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ _STEP = 0.1  # m
 _CELL = 0.2  # m, averaging of the energy
 _ROUNDS = 5
 _FREE_POSITION = 0.3  # m, of a channel while only spacings are compared
+_MIRROR = 1.6  # m either side of an axis of symmetry that are compared
+_MIRROR_RISE = 0.7  # ln, 3 dB: flatter levels have no axis
 _COVERED = 0.6  # part of a wheelset's window that must have been measured
 
 
@@ -34,7 +36,8 @@ class AxleFit:
 
     Arrays have shape (channels, wheelsets): time (s), residual (m, channel offset
     removed), contrast (ln of the energy at
-    the wheelset over that beside it), observed.
+    the wheelset over that beside it), observed. ``place_sigma`` is how well the pulses of each
+    channel tell where the wheelsets are (m); their spacing is known far better.
     """
 
     motion: Motion
@@ -44,7 +47,7 @@ class AxleFit:
     contrast: Array
     observed: NDArray[np.bool_]
     offset: Array
-    anchor_sigma: Array
+    place_sigma: Array
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -60,25 +63,20 @@ def _neighbours(axles: Array) -> NDArray[np.int64]:
     return np.asarray(before + 2 * behind, dtype=np.int64)
 
 
-def _windows(trace: Trace, motion: Motion, places: Array, half: float) -> tuple[Array, Array]:
-    """Energies about each place, shape (places, cells), and the measured fraction per place."""
+def _windows(trace: Trace, centre: Array, speed: Array, half: float) -> tuple[Array, Array]:
+    """Energies about each time, shape (wheelsets, cells), and the measured fraction of each."""
     u = np.arange(-half, half + _STEP / 2, _STEP)
-    centre = motion.time_at(places)[:, None]
-    speed = np.maximum(motion.speed_at(centre), 0.5)
-    start = centre + (u - _CELL / 2) / speed
-    stop = centre + (u + _CELL / 2) / speed
+    start = centre[:, None] + (u - _CELL / 2) / speed[:, None]
+    stop = centre[:, None] + (u + _CELL / 2) / speed[:, None]
     energy = trace.mean(start, stop)
     covered = trace.coverage(start[:, 0], stop[:, -1])
     return energy, covered
 
 
-def _pulse(energy: Array, floor: float, classes: NDArray[np.int64], symmetric: bool) -> Array:
+def _pulse(energy: Array, floor: float, classes: NDArray[np.int64]) -> Array:
     """Mean pulse per class on the grid of the energies, shape (4, cells), mean 1.
 
-    The plain mean gives the finest spacing of wheelsets but no place: it takes up an error
-    common to all of them. ``symmetric``: the pulse of a leading wheelset is the mirror
-    image of a trailing
-    one's, which fixes the place.
+    It gives the finest spacing of wheelsets but no place: it takes up an error common to all.
     """
     cells = energy.shape[1]
     scaled = energy / np.maximum(energy.mean(axis=1, keepdims=True), floor)
@@ -90,12 +88,6 @@ def _pulse(energy: Array, floor: float, classes: NDArray[np.int64], symmetric: b
         shape = np.mean(scaled[members] if members.sum() >= 3 else scaled, axis=0)
         smooth = np.convolve(np.pad(shape, 2, "edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         out[c] = smooth / smooth.mean()
-    if symmetric:
-        before, behind = out[1].copy(), out[2].copy()
-        out[0], out[3] = 0.5 * (out[0] + out[0, ::-1]), 0.5 * (out[3] + out[3, ::-1])
-        if (classes == 1).any() and (classes == 2).any():
-            out[1] = 0.5 * (before + behind[::-1])
-            out[2] = out[1, ::-1]
     return out
 
 
@@ -134,28 +126,54 @@ def _first_shift(energy: Array, reach: float) -> Array:
     return np.asarray((np.argmax(part, axis=1) - steps) * _STEP)
 
 
-def _anchor(offset: Array, classes: NDArray[np.int64]) -> tuple[float, float]:
-    """Place of the plain pulses against the symmetric ones (m), and its standard deviation.
+def _centre(
+    trace: Trace, motion: Motion, places: Array, classes: NDArray[np.int64], reach: float
+) -> tuple[float, float] | None:
+    """Where the pulses lie against the wheelsets (m), and how far their level rises (ln).
 
-    Leading and trailing wheelsets have pulses of their own; where these are not mirror images of
-    each other, the places they give differ, and tell how little the symmetry is worth.
+    A train is the same from both ends: the mean level about leading wheelsets is the mirror image
+    of that about trailing ones. The place is the axis of the best mirror symmetry. ``None``
+    without a pair.
     """
-    places, sigmas = [], []
-    for c in np.unique(classes):
-        members = offset[classes == c]
-        if members.size >= 3:
-            places.append(float(np.median(members)))
-            sigmas.append(1.86 * np.median(np.abs(members - places[-1])) / np.sqrt(members.size))
-    if not places:
-        return float(np.median(offset)), 0.3
-    spread = max(places) - min(places)
-    return float(np.mean(places)), float(np.hypot(np.mean(sigmas), spread))
+    centre = motion.time_at(places)
+    speed = np.maximum(motion.speed_at(centre), 0.5)
+    energy, covered = _windows(trace, centre, speed, _MIRROR + reach)
+    energy = np.log(np.maximum(energy, 0.3 * trace.noise))
+    pulses: dict[int, Array] = {}
+    for c in range(4):
+        members = (classes == c) & (covered > _COVERED)
+        if members.sum() >= 2:
+            pulses[c] = np.mean(energy[members], axis=0)
+    twin = {0: 0, 1: 2, 2: 1, 3: 3}
+    pairs = [(c, float((classes == c).sum())) for c in pulses if twin[c] in pulses]
+    if not pairs:
+        return None
+    middle, width, steps = energy.shape[1] // 2, round(_MIRROR / _STEP), round(reach / _STEP)
+    cost = np.zeros(2 * steps + 1)
+    rise = 0.0
+    for c, weight in pairs:
+        rise = max(rise, float(np.ptp(pulses[c][middle - width : middle + width + 1])))
+        for k in range(-steps, steps + 1):
+            part = slice(middle + k - width, middle + k + width + 1)
+            x, y = pulses[c][part], pulses[twin[c]][part][::-1]
+            x, y = x - x.mean(), y - y.mean()
+            cost[k + steps] += weight * float(
+                np.sum((x - y) ** 2) / (np.sum(x * x) + np.sum(y * y) + 1e-12)
+            )
+    top = int(np.argmin(cost))
+    fraction = 0.0
+    if 0 < top < 2 * steps:
+        left, here, right = cost[top - 1 : top + 2]
+        bend = left - 2 * here + right
+        fraction = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float((top - steps + fraction) * _STEP), rise
 
 
 def fit_axles(
     traces: Sequence[Trace],
     places: Sequence[Array],
     start: Motion,
+    anchors: Sequence[Trace],
 ) -> AxleFit:
     """Times of the wheelsets of a train at every rail channel, and its motion.
 
@@ -163,6 +181,7 @@ def fit_axles(
         traces: rail channels.
         places: per trace, distance s (m) at which each wheelset passes it.
         start: rough motion, good to about 1 m everywhere.
+        anchors: the same channels in their lowest band, where the rail bends under the wheel.
     """
     motion = start
     count = places[0].size
@@ -172,53 +191,70 @@ def fit_axles(
     half = _HALF + 0.6
     classes = _neighbours(places[0])
     fit: Fit | None = None
+    channel = np.zeros(0, dtype=np.int64)
     shape = (len(traces), count)
     time, contrast = np.zeros(shape), np.zeros(shape)
     observed = np.zeros(shape, dtype=bool)
-    anchor = np.zeros(len(traces))
-    anchor_sigma = np.zeros(len(traces))
+    shift = np.zeros(shape)  # of every wheelset from where the motion expects it (m)
     for round_ in range(_ROUNDS):
-        last = round_ == _ROUNDS - 1
         for k, trace in enumerate(traces):
-            energy, covered = _windows(trace, motion, places[k], half)
+            expected = motion.time_at(places[k])
+            speed = np.maximum(motion.speed_at(expected), 0.5)
+            # every window stands at its own wheelset: about the places of a wrong type the mean
+            # pulse would grow two humps and hide that the type is wrong
+            energy, covered = _windows(trace, expected + shift[k] / speed, speed, half)
             if round_ == 0:
-                shift = _first_shift(energy, reach)
+                shift[k] = _first_shift(energy, reach)
             else:
                 near = min(reach, 0.6)
-                pulse = _pulse(energy, trace.noise, classes, symmetric=False)
-                shift = _best_shift(energy, pulse[classes], trace.noise, near)
-                if last:
-                    pulse = _pulse(energy, trace.noise, classes, symmetric=True)
-                    centred = _best_shift(energy, pulse[classes], trace.noise, near)
-                    anchor[k], anchor_sigma[k] = _anchor(centred - shift, classes)
-            centre = motion.time_at(places[k])
-            speed = np.maximum(motion.speed_at(centre), 0.5)
-            time[k] = centre + (shift + anchor[k]) / speed
+                pulse = _pulse(energy, trace.noise, classes)
+                more = _best_shift(energy, pulse[classes], trace.noise, near)
+                shift[k] = np.clip(shift[k] + more, -reach, reach)
+            # leading and trailing wheelsets have pulses of their own, whose places relative to the
+            # wheelset differ by decimetres: their wheelbase is taken from the type, not measured
+            for c in np.unique(classes):
+                shift[k, classes == c] -= np.median(shift[k, classes == c])
+            time[k] = expected + shift[k] / speed
             middle = energy.shape[1] // 2
             at = energy[:, middle - 4 : middle + 5].mean(axis=1)
             beside = np.minimum(energy[:, :6].mean(axis=1), energy[:, -6:].mean(axis=1))
             contrast[k] = np.log(np.maximum(at, trace.noise) / np.maximum(beside, trace.noise))
             observed[k] = covered > _COVERED
+        if observed.sum() < 4:
+            fit = None
+            break
         flat_time = time[observed]
         flat_place = np.stack(list(places))[observed]
-        if flat_time.size < 4:
-            break
         channel = np.nonzero(observed)[0]
-        sigma = float(np.hypot(POSITION_SIGMA, anchor_sigma.max())) if last else _FREE_POSITION
-        fit = regress(flat_time, flat_place, channel, motion.epoch, position_sigma=sigma)
+        fit = regress(flat_time, flat_place, channel, motion.epoch, position_sigma=_FREE_POSITION)
+        moved = [fit.motion.time_at(places[k]) for k in range(len(traces))]
+        speeds = [np.maximum(fit.motion.speed_at(t), 0.5) for t in moved]
+        for k in range(len(traces)):
+            shift[k] = np.clip((time[k] - moved[k]) * speeds[k], -reach, reach)
         motion = fit.motion
         if motion.speed < 1.0:
+            fit = None
             break
+    place_sigma = np.full(len(traces), HIGH_BAND_POSITION_SIGMA)
     residual = np.zeros(shape)
     if fit is not None:
+        for k, trace in enumerate(anchors):
+            found = _centre(trace, motion, places[k], classes, 1.0)
+            if found is None or found[1] < _MIRROR_RISE:
+                found = _centre(traces[k], motion, places[k], classes, reach)
+            else:
+                place_sigma[k] = POSITION_SIGMA
+            if found is not None:
+                time[k] += found[0] / np.maximum(motion.speed_at(motion.time_at(places[k])), 0.5)
+        fit = regress(time[observed], np.stack(list(places))[observed], channel, motion.epoch)
         residual[observed] = fit.residual
     return AxleFit(
-        motion=motion,
+        motion=motion if fit is None else fit.motion,
         scale=fit.scale if fit is not None else float("inf"),
         time=time,
         residual=residual,
         contrast=contrast,
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
-        anchor_sigma=anchor_sigma,
+        place_sigma=place_sigma,
     )

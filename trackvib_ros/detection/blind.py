@@ -238,7 +238,7 @@ def _one_channel(
     sigma = WHEELBASE_SPREAD * speed
     method = "typical wheelbase"
     if guess is not None and abs(guess / speed - 1) < 2 * WHEELBASE_SPREAD:
-        speed, sigma, method = guess, 0.02 * guess, "nearest catalogue type"
+        speed, sigma, method = guess, 0.06 * guess, "nearest catalogue type"
     epoch = float(times[0])
     covariance = np.diag([0.3**2, sigma**2, 0.6**2])
     motion = Motion(epoch, 0.0, speed, 0.0, covariance)

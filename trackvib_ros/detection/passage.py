@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,9 @@ from .axles import AxleFit, fit_axles
 from .blind import Blind, describe
 from .catalogue import Catalogue, TrainType
 from .events import Channel
+from .evidence import Candidate, Explanation, explain
 from .features import Window
-from .kinematics import POSITION_SIGMA, Motion, robust_scale
+from .kinematics import Motion, robust_scale
 from .pattern import Match, Trace, refine, scan
 
 Array = NDArray[np.float64]
@@ -31,15 +31,8 @@ CONFIRM_CORRELATION = 0.6
 HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
 
-_POSTERIOR_TEMPER = 0.5  # all wheelsets meet the same rail: their residuals are not independent
-_OFFSET_COST = 12.0  # most that the place of a channel may count against a type
-_MODEL_SIGMA = 0.04  # m, systematic residuals of a right type (bogies nod, pulses overlap)
-_SCORE_WEIGHT = 120.0
-_SCORE_NOISE = 0.03  # scores of equally right types differ by this much
 _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
-_SCALE_DOUBT = 0.12  # a delay off by less speaks of an unknown type, by more of a clock
-_DELAY_DOUBT = 0.015  # least disagreement of a delay that excludes a type
-_MISFIT_M, _MISFIT_CHI2 = 0.07, 25.0
+_STRETCH = 1.4  # a delay that fits no type better than this is a clock's fault, not an unknown type
 
 
 @dataclass(frozen=True)
@@ -68,33 +61,6 @@ class Hypothesis:
         return self.train.oriented(self.reverse)
 
     @property
-    def misfit(self) -> bool:
-        """Whether wheelsets in the same place of a car are off by the same amount.
-
-        Residuals are averaged over the wheelsets with the same distances to their neighbours; a
-        wrong type leaves means of several centimetres where noise would average out.
-        """
-        gaps = np.round(np.diff(self.places, prepend=-99.0, append=self.places[-1] + 99.0), 1)
-        keys = [f"{a} {b}" for a, b in pairwise(gaps)]
-        good = self.fit.observed & (np.abs(self.fit.residual) < 0.5)
-        square, chi2, total, within = 0.0, 0.0, 0, 0.0
-        groups = []
-        for key in set(keys):
-            members = np.array([k == key for k in keys])
-            values = self.fit.residual[:, members][good[:, members]]
-            if values.size >= 4:
-                groups.append(values)
-                within += float(np.sum((values - values.mean()) ** 2))
-                total += values.size
-        if total <= len(groups) or not groups:
-            return False
-        variance = max(within / (total - len(groups)), 0.01**2)
-        for values in groups:
-            square += values.size / total * float(values.mean()) ** 2
-            chi2 += values.size * float(values.mean()) ** 2 / variance
-        return bool(square > _MISFIT_M**2 and chi2 > _MISFIT_CHI2)
-
-    @property
     def mid_time(self) -> float:
         """Time at which the middle of the train passes the reference point (s)."""
         return float(self.fit.motion.time_at(0.5 * self.train.span))
@@ -108,6 +74,7 @@ class Passage:
         interval: first and last strong energy at the reference channel (s).
         traces: rail channels used, reference first, in the band that was kept.
         direction: +1, -1, or 0 if unknown.
+        explanations: types, relatives of them and wrong clocks, most probable first.
         clock_offset: (channel, offset s, sigma s) for channels whose clock contradicts the motion.
         delay: speed by the delays between two channels (m/s), sigma; or None.
     """
@@ -117,6 +84,7 @@ class Passage:
     band: tuple[float, float]
     hypotheses: tuple[Hypothesis, ...]
     direction: int
+    explanations: tuple[Explanation, ...] = ()
     clock_offset: tuple[tuple[str, float, float], ...] = ()
     delay: tuple[float, float] | None = None
     quality: tuple[str, ...] = ()
@@ -129,27 +97,14 @@ class Passage:
         return self.hypotheses[0].score if self.hypotheses else self.coarse_score
 
     @property
-    def known(self) -> bool:
-        """Whether a catalogue type explains the pattern."""
-        return (
-            bool(self.hypotheses)
-            and self.score >= KNOWN_SCORE
-            and not self.hypotheses[0].misfit
-            and not self.contradicted
-        )
+    def unknown(self) -> float:
+        """Probability that the type is not in the catalogue."""
+        return sum(e.probability for e in self.explanations if e.kind in ("scaled", "varied"))
 
     @property
-    def contradicted(self) -> bool:
-        """Whether the delay between channels excludes the scale of every probable type."""
-        if self.delay is None:
-            return False
-        speed, sigma = self.delay
-        for h in self.hypotheses:
-            if h.probability > 0.01:
-                other = float(h.fit.motion.speed_at(h.mid_time))
-                if abs(speed - other) < max(4 * sigma, _DELAY_DOUBT * speed):
-                    return False
-        return True
+    def known(self) -> bool:
+        """Whether a catalogue type explains the pattern."""
+        return bool(self.hypotheses) and self.score >= KNOWN_SCORE and self.unknown < 0.5
 
     @property
     def confirmed(self) -> bool:
@@ -226,6 +181,7 @@ def quiet_gaps(
 @dataclass(frozen=True)
 class _Scanned:
     trace: Trace
+    low: Trace
     band: tuple[float, float]
     interval: tuple[float, float]
     matches: list[Match]
@@ -243,13 +199,14 @@ def _scan_channel(
     truncated: bool,
 ) -> _Scanned | None:
     found = []
-    for trace, band in zip(traces_of(record, within), record.window.bands, strict=True):
+    traces = traces_of(record, within)
+    for trace, band in zip(traces, record.window.bands, strict=True):
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
         stretch = (0.3, 1.25) if truncated else (0.80, 1.25)
         matches = scan(trace, interval, trains, limits, stretch)
-        found.append(_Scanned(trace, band, interval, matches))
+        found.append(_Scanned(trace, traces[0], band, interval, matches))
     if not found:
         return None
     top = max(s.score for s in found)
@@ -312,8 +269,6 @@ def find_passage(
         passage = _fit_hypotheses(usable, reference)
     if passage.known:
         return passage
-    # an unknown type scales the pattern: then a delay that does not fit accuses no clock
-    passage = replace(passage, clock_offset=(), quality=())
     guess = None
     if passage.hypotheses:
         best = passage.hypotheses[0]
@@ -322,108 +277,121 @@ def find_passage(
     return replace(passage, blind=blind)
 
 
-def _direction(
+def _delays(
     usable: Sequence[_Scanned], best: Match
-) -> tuple[int, list[_Scanned], list[tuple[str, float, float]], tuple[float, float] | None]:
-    """Direction from the order of the channels; channels whose clock fits neither direction."""
-    starts: dict[str, float] = {}
-    for s in usable:
-        for match in s.matches:
-            if match.train.name == best.train.name and match.reverse == best.reverse:
-                starts[s.trace.name] = float(np.median(match.times() - best.times()))
+) -> tuple[int, list[tuple[_Scanned, float]], list[tuple[str, float, float]]]:
+    """Direction by the order of the channels; the delays (s) of those whose clock can be right."""
     reference = usable[0]
-    votes = []
+    kept = [(reference, 0.0)]
+    votes: list[int] = []
     offsets: list[tuple[str, float, float]] = []
-    scale: tuple[float, float] | None = None
-    kept = [reference]
     for s in usable[1:]:
-        if s.trace.name not in starts:
+        delays = [
+            float(np.median(m.times() - best.times()))
+            for m in s.matches
+            if m.train.name == best.train.name and m.reverse == best.reverse
+        ]
+        if not delays:
             continue
-        baseline = s.trace.x - reference.trace.x
-        delay = starts[s.trace.name]
-        if abs(baseline) < 0.5:
-            kept.append(s)
-            continue
-        # another type of nearly the same pattern may explain the delay where the best does not
-        speeds = [m.speed for m in usable[0].matches if m.score > best.score - 0.1]
-        error, sign = min(
-            (abs(delay - sign * baseline / v) * v, sign) for v in speeds for sign in (1, -1)
+        baseline, delay = s.trace.x - reference.trace.x, delays[0]
+        expected = min(
+            (baseline / best.speed, -baseline / best.speed), key=lambda e: abs(delay - e)
         )
-        expected = baseline / best.speed
-        if error < max(0.8, 0.04 * abs(baseline)):
-            votes.append(sign)
-            kept.append(s)
-        elif abs(abs(delay / expected) - 1) < _SCALE_DOUBT:
-            scale = (abs(baseline / delay), 0.05 * best.speed / abs(baseline))
+        if abs(baseline) < 0.5:
+            kept.append((s, delay))
+        elif abs(delay - expected) * best.speed < 0.8 or 1 / _STRETCH < delay / expected < _STRETCH:
+            votes.append(1 if delay * baseline > 0 else -1)
+            kept.append((s, delay))
         else:
             offsets.append((s.trace.name, delay - expected, 0.5 / best.speed))
-    if not votes or abs(sum(votes)) != len(votes):
-        return 0, [reference] if votes else kept, offsets, scale
-    return votes[0], kept, offsets, scale
+    if votes and abs(sum(votes)) != len(votes):
+        return 0, [(reference, 0.0)], offsets
+    return (votes[0] if votes else 0), kept, offsets
 
 
 def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
     best = reference.matches[0]
-    direction, kept, offsets, scale = _direction(usable, best)
+    direction, kept, offsets = _delays(usable, best)
     table: dict[tuple[str, bool], list[float]] = {}
-    for s in kept:
+    for s, _ in kept:
         for match in s.matches:
             table.setdefault((match.train.name, match.reverse), []).append(match.score)
-    hypotheses: list[Hypothesis] = []
+    trains: list[Hypothesis] = []
+    candidates: list[Candidate] = []
+    shifts = np.array([(direction or 1) * (s.trace.x - reference.trace.x) for s, _ in kept])
     for match in reference.matches:
         score = sum(table[match.train.name, match.reverse]) / len(kept)
         if score < best.score - 0.25:
             continue
         places = match.train.oriented(match.reverse)
-        sign = direction or 1
-        shifts = [sign * (s.trace.x - reference.trace.x) for s in kept]
-        fit = fit_axles([s.trace for s in kept], [places + d for d in shifts], _recentred(match))
+        fit = fit_axles(
+            [s.trace for s, _ in kept],
+            # where the pattern was seen; whether the distance agrees is for the evidence to say
+            [places + delay * match.speed for _, delay in kept],
+            _recentred(match),
+            [s.low for s, _ in kept],
+        )
         if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
             continue
-        hypotheses.append(Hypothesis(match.train, match.reverse, direction, score, fit))
-    hypotheses = ranked(hypotheses)
+        trains.append(Hypothesis(match.train, match.reverse, direction, score, fit))
+        candidates.append(Candidate(places, shifts, fit, score))
+    explanations = explain(candidates)
+    if explanations and explanations[0].kind == "clock":
+        wrong = kept[explanations[0].channel][0]
+        fit, motion = trains[explanations[0].candidate].fit, explanations[0].motion
+        k = explanations[0].channel
+        late = fit.time[k] - motion.time_at(
+            candidates[explanations[0].candidate].places + shifts[k]
+        )
+        told = (wrong.trace.name, float(np.median(late)), 0.2 / motion.speed)
+        passage = _fit_hypotheses([s for s in usable if s is not wrong], reference)
+        return replace(
+            passage,
+            clock_offset=(*passage.clock_offset, told),
+            quality=tuple({*passage.quality, "unsynchronised"}),
+        )
+    hypotheses = _with_probabilities(trains, explanations)
     passage = Passage(
         interval=reference.interval,
-        traces=tuple(s.trace for s in kept),
+        traces=tuple(s.trace for s, _ in kept),
         band=reference.band,
         hypotheses=tuple(hypotheses),
         direction=direction,
+        explanations=tuple(explanations),
         clock_offset=tuple(offsets),
         quality=("unsynchronised",) if offsets else (),
-        delay=scale,
     )
     if hypotheses and direction:
         passage = replace(passage, delay=delay_speed(passage))
     return passage
 
 
-def ranked(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Hypotheses with their probabilities, most probable first.
+def _with_probabilities(
+    trains: Sequence[Hypothesis], explanations: Sequence[Explanation]
+) -> list[Hypothesis]:
+    """Types with their probabilities and their motion, most probable first.
 
-    The profile likelihood of Gaussian residuals, N ln(scale), and the pattern correlation.
+    If no type of the catalogue is likely, the order is that of the relatives.
     """
-    if not hypotheses:
-        return []
-    # residuals of different hypotheses must be compared with the same outliers
-    spreads = []
-    for h in hypotheses:
-        residual = np.clip(h.fit.residual[h.fit.observed], -0.4, 0.4)
-        spreads.append(float(np.sqrt(np.mean(residual**2) + _MODEL_SIGMA**2)))
-    least = min(spreads)
-    # the clearest of the fits tells how well the pulses give the places of the channels
-    anchor = min(float(h.fit.anchor_sigma.max()) for h in hypotheses)
-    place = 2**0.5 * float(np.hypot(POSITION_SIGMA, anchor))
-    top = max(h.score for h in hypotheses)
-    logs = []
-    for h, spread in zip(hypotheses, spreads, strict=True):
-        count = int(h.fit.observed.sum())
-        log = -_POSTERIOR_TEMPER * count * np.log(spread / least)
-        log -= 0.5 * min(float(np.sum((h.fit.offset / place) ** 2)), _OFFSET_COST)
-        logs.append(log - _SCORE_WEIGHT * max(0.0, top - h.score - _SCORE_NOISE))
-    weights = np.exp(np.array(logs) - max(logs))
-    weights /= weights.sum()
-    out = [replace(h, probability=float(p)) for h, p in zip(hypotheses, weights, strict=True)]
-    return sorted(out, key=lambda h: -h.probability)
+    total = np.zeros(len(trains))
+    related = np.zeros(len(trains))
+    motion: dict[int, Motion] = {}
+    unknown = sum(e.probability for e in explanations if e.kind in ("scaled", "varied")) > 0.5
+    for e in explanations:
+        if e.kind == "type":
+            total[e.candidate] += e.probability
+        related[e.candidate] += e.probability
+        if (e.kind == "type") != unknown:
+            motion.setdefault(e.candidate, e.motion)
+    order = np.argsort(-(related if unknown else total))
+    return [
+        replace(
+            trains[i],
+            probability=float(total[i]),
+            fit=replace(trains[i].fit, motion=motion.get(int(i), trains[i].fit.motion)),
+        )
+        for i in order
+    ]
 
 
 def delay_speed(passage: Passage) -> tuple[float, float] | None:
@@ -452,8 +420,7 @@ def delay_speed(passage: Passage) -> tuple[float, float] | None:
     mean = float(ratio[good].mean())
     sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
     speed = float(fit.motion.speed_at(best.mid_time)) / mean
-    place = np.hypot(POSITION_SIGMA, fit.anchor_sigma[[a, b]])
-    baseline = float(np.hypot(*place)) / (x[b] - x[a])
+    baseline = float(np.hypot(*fit.place_sigma[[a, b]])) / (x[b] - x[a])
     return speed, speed * float(np.hypot(sigma / mean, baseline))
 
 

@@ -185,8 +185,8 @@ def _scan_once(
             if j in found and found[j].score >= score:
                 continue
             place = (offset + 0.5 - n / 2) * _CELL
-            if place > n / 2 * _CELL - train.span:
-                place -= n * _CELL
+            # the middle of the train, not its head, is near the epoch
+            place -= n * _CELL * round((place + train.span / 2) / (n * _CELL))
             v = float(part[rows[row]])
             square = max(v * v + 2 * acceleration * place, 0.01 * v * v)
             start = epoch + 2 * place / (v + np.sqrt(square))

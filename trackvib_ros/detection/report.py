@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from .blind import Blind
 from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
+from .evidence import half_interval
 from .health import clipped
-from .kinematics import POSITION_SIGMA
 from .live import Provisional
-from .passage import CONFIRM_SCORE, Hypothesis, Passage, Record
+from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage, Record
 
 Array = NDArray[np.float64]
 
 _DIRECTION = {1: "forward", -1: "backward", 0: "unknown"}
 _UNITS = {1: "single", 2: "double"}
-_UNKNOWN_SCALE = 0.02  # relative error of the speed when the nearest type stands for an unknown one
-_PULSE_SIGMA_S, _PULSE_SIGMA_M = 0.0015, POSITION_SIGMA  # centre of a pulse against its wheelset
+_GEOMETRY = 0.03  # m, wheelsets of a train against its type
+_PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
 
 
@@ -85,11 +85,7 @@ def closing(
         ]
     for passage in trains:
         quality = [*flags, *passage.quality, *_window_flags(records, passage)]
-        use_blind = passage.blind is not None and (
-            passage.contradicted or passage.score < CONFIRM_SCORE or passage.blind.direction != 0
-        )
-        if not passage.known and use_blind:
-            assert passage.blind is not None
+        if passage.blind is not None and _prefer_blind(passage, passage.blind):
             events += _unknown(catalogue, origin_ns, passage, passage.blind, quality)
         else:
             events += _train(catalogue, origin_ns, passage, quality)
@@ -116,17 +112,40 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
     return sorted(flags)
 
 
-def mixture(hypotheses: Sequence[Hypothesis]) -> tuple[float, float, float]:
-    """Speed of the best hypothesis at mid-train, its own sigma, and sigma with the ambiguity."""
-    best = hypotheses[0]
-    speed = float(best.fit.motion.speed_at(best.mid_time))
-    own = best.fit.motion.speed_sigma(best.mid_time)
-    variance = 0.0
-    for h in hypotheses:
-        other = float(h.fit.motion.speed_at(best.mid_time))
-        sigma = h.fit.motion.speed_sigma(best.mid_time)
-        variance += h.probability * ((other - speed) ** 2 + sigma**2)
-    return speed, own, float(np.sqrt(variance))
+def _prefer_blind(passage: Passage, blind: Blind) -> bool:
+    """Whether peaks tell more of an unknown train than the nearest pattern of the catalogue."""
+    if not passage.hypotheses or passage.score < KNOWN_SCORE:
+        return blind.direction != 0 or passage.score < CONFIRM_SCORE or blind.regular >= 0.9
+    pattern = passage.hypotheses[0].places.size
+    return blind.regular >= 0.9 and blind.direction != 0 and blind.times.size != pattern
+
+
+def _speed(passage: Passage) -> tuple[float, float, float, tuple[float, float]]:
+    """Speed at mid-train (m/s), its sigma under the best explanation and over all, 95 % interval.
+
+    The interval leaves out what is less likely than one in twenty. With one channel the sigma
+    contains the small chance that the train is a relative of the type, some percent larger or
+    smaller; with two it is that of the interval.
+    """
+    best = passage.hypotheses[0]
+    when = best.mid_time
+    parts, relatives = [], []
+    for e in passage.explanations:
+        part = (e.probability, float(e.motion.speed_at(when)), e.motion.speed_sigma(when))
+        if e.kind != "clock":
+            parts.append(part)
+        if e.kind in ("scaled", "varied"):
+            relatives.append(part)
+    own = best.fit.motion.speed_sigma(when)
+    speed = float(best.fit.motion.speed_at(when))
+    if not passage.known:
+        speed = sum(w * v for w, v, _ in relatives) / sum(w for w, _, _ in relatives)
+    total = sum(w for w, _, _ in parts)
+    variance = sum(w * ((v - speed) ** 2 + s**2) for w, v, s in parts) / total
+    half = max(half_interval(parts, speed), 1.96 * own)
+    # the delay between two channels bounds the size of an unlisted train; one channel cannot
+    sigma = half / 1.96 if len(passage.traces) > 1 else max(variance**0.5, own)
+    return speed, own, sigma, (speed - half, speed + half)
 
 
 def families(hypotheses: Sequence[Hypothesis]) -> tuple[tuple[str, float], ...]:
@@ -155,13 +174,19 @@ def _train(
     def stamp(time: float) -> int:
         return origin_ns + round(time * 1e9)
 
-    axle_sigma = fit.scale / np.maximum(motion.speed_at(motion.time_at(places)), 0.5)
+    # a train is built more regularly than a pulse in noise is placed: mostly the motion tells where
+    # the wheelsets of a known type are
+    trust = _GEOMETRY**2 / (_GEOMETRY**2 + fit.scale**2) if passage.known else 1.0
+    predicted = motion.time_at(places)
+    axle_times = np.where(fit.used[0], predicted + trust * (fit.time[0] - predicted), predicted)
+    scatter = float(np.sqrt(trust) * fit.scale)
     events: list[TrainEvent] = []
     reference = passage.traces[0]
     confidences = []
     for i in range(places.size):
         seen = bool(fit.used[0, i])
-        time = float(fit.time[0, i]) if seen else float(motion.time_at(places[i]))
+        time = float(axle_times[i])
+        speed_here = max(float(motion.speed_at(time)), 0.5)
         clear = 1 / (1 + np.exp(-3 * (float(fit.contrast[0, i]) - 0.5)))
         confidence = best.score * (clear if seen else 0.3)
         confidences.append(confidence)
@@ -169,23 +194,28 @@ def _train(
             TrainEvent(
                 kind="axle",
                 stamp_ns=stamp(time),
-                sigma_s=float(np.hypot(axle_sigma[i], _PULSE_SIGMA_S)),
+                sigma_s=float(
+                    np.hypot(
+                        motion.time_sigma(time), np.hypot(scatter / speed_here, _PULSE_SIGMA_S)
+                    )
+                ),
                 confidence=float(np.clip(confidence, 0.01, 0.99)),
                 method="pulse shift by maximum likelihood" if seen else "predicted by the motion",
                 sensors=(reference.name,),
                 values={"number": i + 1, "position": Estimate(float(places[i]), 0.05, "m")},
             )
         )
-    first, last = float(motion.time_at(places[0])), float(motion.time_at(places[-1]))
-    speed, own, sigma = mixture(passage.hypotheses)
     known = passage.known
+    speed, own, sigma, interval = _speed(passage)
+    first, last = float(motion.time_at(places[0])), float(motion.time_at(places[-1]))
     if not known:
-        sigma = max(sigma, _UNKNOWN_SCALE * speed)
         quality = [*quality, "unknown_type"]
-    passing_sigma = float(np.hypot(motion.time_sigma(first), motion.time_sigma(last)))
-    systematic = float(np.hypot(_PULSE_SIGMA_S, _PULSE_SIGMA_M / speed))
-    first_sigma = float(np.hypot(motion.time_sigma(first), systematic))
-    last_sigma = float(np.hypot(motion.time_sigma(last), systematic))
+        first, last = (
+            float(fit.time[0, i]) if fit.observed[0, i] else t for i, t in ((0, first), (-1, last))
+        )
+    first_sigma = float(np.hypot(motion.time_sigma(first), _PULSE_SIGMA_S))
+    last_sigma = float(np.hypot(motion.time_sigma(last), _PULSE_SIGMA_S))
+    passing_sigma = float(np.hypot(2**0.5 * fit.scale / speed, _PULSE_SIGMA_S))
     values: dict[str, Value] = {
         "grade": CONFIRMED,
         "reference": reference.name,
@@ -196,6 +226,7 @@ def _train(
         "departure_sigma": last_sigma,
         "passing_time": Estimate(last - first, passing_sigma, "s"),
         "speed": Estimate(speed, sigma, "m/s"),
+        "speed_interval": tuple(round(v, 6) for v in interval),
         "speed_at": "middle of the train at the reference point",
         "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
         "direction": _DIRECTION[passage.direction],
@@ -203,6 +234,7 @@ def _train(
         "type": train.name if known else "unknown",
         "type_probability": round(best.probability, 4),
         "families": families(passage.hypotheses),
+        "unknown_probability": round(passage.unknown, 4),
         "types": tuple(
             (h.train.name, round(h.probability, 4))
             for h in passage.hypotheses
@@ -211,14 +243,23 @@ def _train(
         "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
         "cars": train.cars if known else "unknown",
         "units": _UNITS.get(train.units, str(train.units)) if known else "unknown",
-        "train_length": Estimate(train.length, train.length * sigma / speed, "m"),
         "score": round(best.score, 4),
-        "speed_template": Estimate(speed, own, "m/s"),
-        "speed_passing_time": Estimate(
-            train.span / (last - first), train.span / (last - first) ** 2 * passing_sigma, "m/s"
-        ),
+        "speed_template": Estimate(float(motion.speed_at(best.mid_time)), own, "m/s"),
         "catalogue": catalogue.version,
     }
+    duration = last - first
+    if known:
+        values["train_length"] = Estimate(train.length, train.length * sigma / speed, "m")
+        values["speed_passing_time"] = Estimate(
+            train.span / duration, train.span / duration**2 * passing_sigma, "m/s"
+        )
+    else:
+        passed = np.where(fit.used[0], fit.time[0], motion.time_at(places))
+        gaps = np.diff(motion.distance_at(passed))
+        length = train.length - train.span + float(gaps.sum())
+        values["train_length"] = Estimate(length, float(np.hypot(length * sigma / speed, 1.0)), "m")
+        values["axle_spacings"] = tuple(round(float(gap), 2) for gap in gaps)
+        values["axle_spacing_sigma"] = round(float(np.hypot(0.2, 2.5 * sigma / speed)), 3)
     if passage.delay is not None:
         values["speed_delay"] = Estimate(*passage.delay, "m/s")
     confidence = float(np.clip(best.score, 0.0, 0.99))
@@ -268,7 +309,7 @@ def _unknown(
     def stamp(time: float) -> int:
         return origin_ns + round(time * 1e9)
 
-    time_sigma = float(np.hypot(0.3 / speed, _PULSE_SIGMA_S))
+    time_sigma = float(np.hypot(0.4 / speed, _PULSE_SIGMA_S))
     events = [
         TrainEvent(
             kind="axle",

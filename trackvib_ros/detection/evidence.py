@@ -1,0 +1,226 @@
+"""Which explanation of the wheelset times is right: a type of the catalogue, a relative of it, a
+wrong clock.
+
+Every explanation is a linear model with Gaussian effects: place of wheelset i at channel c,
+
+    p_ci = s0 + v t + a t²/2 + place_c + class_k(i) + noise (+ its own effects),
+
+so its evidence and the motion under it follow in closed form (Rasmussen & Williams, Gaussian
+Processes for Machine Learning, 2006, eq. 2.43). An unknown train is a catalogue type whose size and
+gaps may differ: what is left of its speed is what the data and this prior allow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.special import ndtr
+
+from .axles import AxleFit
+from .kinematics import PRIOR_ACCELERATION, Motion
+
+Array = NDArray[np.float64]
+Kind: TypeAlias = Literal["type", "scaled", "varied", "clock"]
+
+PRIOR_UNKNOWN = 0.05
+"""Prior probability that a train is not in the catalogue."""
+
+PRIOR_CLOCK = 0.01
+"""Prior probability that a channel's clock is off."""
+
+_CLASS_SIGMA = (
+    0.013  # m, wheelsets with other neighbours have other pulses; rms on computed passages
+)
+_LEAST_NOISE = 0.02  # m, geometric tolerance of a train
+_SCALE = 0.04  # catalogue types of one shape differ this much in size (CRH1 : CR400AF 6 %)
+_SCALE_VARIED = 0.08
+_SHAPE = 0.06  # m, how well the gaps of such relatives agree after scaling
+_GAP_NEAR, _GAP_FAR = 0.2, 0.6  # m, spread of wheelbases and of the other gaps between types
+_NEAR = 3.5  # m
+_CLOCK_S = 0.1
+_OUTLIER = 2.5
+_NULL_LOG = float(np.log(2.2))  # a wheelset found anywhere within its window of 2.2 m
+_SCORE_WEIGHT = 120.0
+_SCORE_NOISE = 0.03  # scores of equally right types differ by this much
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A fitted type: nominal places behind the first wheelset (m), shift of every channel (m)."""
+
+    places: Array
+    shifts: Array
+    fit: AxleFit
+    score: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One model of the passage.
+
+    Attributes:
+        candidate: index of the type it starts from.
+        kind: ``type`` as in the catalogue; ``scaled`` a relative of the same shape; ``varied`` one
+            with other gaps; ``clock`` the type, and the clock of ``channel`` is off.
+        probability: posterior.
+        motion: under this model, with covariance.
+    """
+
+    candidate: int
+    kind: Kind
+    probability: float
+    motion: Motion
+    channel: int = -1
+
+
+def _classes(places: Array) -> NDArray[np.int64]:
+    """Number of every wheelset's class: same distances to both neighbours (within 0.2 m)."""
+    gaps = np.round(np.diff(places, prepend=places[0] - 99.0, append=places[-1] + 99.0) / 0.2)
+    pairs = np.minimum(np.stack([gaps[:-1], gaps[1:]], axis=1), 60.0)
+    return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), dtype=np.int64)
+
+
+def _noise(candidate: Candidate) -> float:
+    """Scatter of wheelsets of one class about their median (m), outliers limited."""
+    classes = _classes(candidate.places)
+    residual = candidate.fit.residual
+    rest, members = [], 0
+    for c in range(residual.shape[0]):
+        for k in np.unique(classes):
+            use = candidate.fit.observed[c] & (classes == k)
+            if use.sum() >= 3:
+                rest.append(residual[c, use] - np.median(residual[c, use]))
+                members += int(use.sum())
+    if not rest:
+        return 0.1
+    off = np.concatenate(rest)
+    limit = 4 * max(1.4826 * float(np.median(np.abs(off))), _LEAST_NOISE)
+    square = float(np.sum(np.minimum(np.abs(off), limit) ** 2)) / max(members - len(rest), 1)
+    return max(float(np.sqrt(square)), _LEAST_NOISE)
+
+
+def _model(candidate: Candidate, noise: float, effects: Sequence[Array]) -> tuple[float, Motion]:
+    """Log evidence against wheelsets anywhere, and the motion.
+
+    Args:
+        candidate: the type.
+        noise: of a wheelset (m).
+        effects: random effects of unit variance on the places, each of shape (channels, wheelsets).
+    """
+    fit, start = candidate.fit, candidate.fit.motion
+    seen = fit.observed
+    t = fit.time[seen] - start.epoch
+    # what the first regression left, so that nothing large cancels
+    rest = (candidate.places[None, :] + candidate.shifts[:, None])[seen]
+    rest = rest - start.distance_at(fit.time[seen])
+    spread = max(fit.scale, noise)
+    excess = np.maximum(1.0, np.abs(fit.residual[seen]) / (_OUTLIER * spread))
+    z = np.stack([effect[seen] for effect in effects], axis=1)
+    factor = linalg.cho_factor(np.diag((noise * excess) ** 2) + z @ z.T, lower=True)
+    x = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
+    solved = linalg.cho_solve(factor, np.column_stack([x, rest]))
+    prior = PRIOR_ACCELERATION**-2
+    # the times are observed, not the places: density ds/dt = v per wheelset, without which a train
+    # of free size would shrink to nothing
+    slope = np.stack([np.zeros_like(t), np.ones_like(t), t], axis=1)
+    slope /= start.speed_at(fit.time[seen])[:, None]
+    normal = x.T @ solved[:, :3] + np.diag([1e-9, 1e-9, prior]) + slope.T @ slope
+    right = x.T @ solved[:, 3] - np.array([0.0, 0.0, prior * start.acceleration])
+    right += slope.sum(axis=0)
+    change = np.linalg.solve(normal, right)
+    misfit = float(rest @ solved[:, 3] + prior * start.acceleration**2 - right @ change)
+    log = -0.5 * misfit - float(np.sum(np.log(np.diag(factor[0]))))
+    log -= 0.5 * float(np.linalg.slogdet(normal)[1])
+    log += t.size * (_NULL_LOG - 0.5 * float(np.log(2 * np.pi)))
+    motion = Motion(
+        start.epoch,
+        start.distance + float(change[0]),
+        start.speed + float(change[1]),
+        start.acceleration + float(change[2]),
+        np.linalg.inv(normal),
+    )
+    return log, motion
+
+
+def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
+    """Every explanation with its posterior probability, most probable first."""
+    if not candidates:
+        return []
+    top = max(c.score for c in candidates)
+    noise = min(_noise(c) for c in candidates if c.score > top - 2 * _SCORE_NOISE)
+    found: list[tuple[float, int, Kind, int, Motion]] = []
+    for index, c in enumerate(candidates):
+        channels, axles = c.fit.observed.shape
+        classes = _classes(c.places)
+        base: list[Array] = []
+        for k in range(channels):
+            effect = np.zeros((channels, axles))
+            effect[k] = c.fit.place_sigma[k]
+            base.append(effect)
+        for k in range(int(classes.max()) + 1):
+            base.append(np.tile(_CLASS_SIGMA * (classes == k), (channels, 1)))
+        rounded = np.round(np.diff(c.places), 1)
+        counts = []
+        for gap in np.unique(rounded):
+            before = np.concatenate([[0.0], np.cumsum(rounded == gap)])
+            counts.append((float(gap), np.tile(before, (channels, 1))))
+        along = np.tile(c.places, (channels, 1))
+        scaled = [_SCALE * along, *(_SHAPE * n for _, n in counts)]
+        varied = [
+            _SCALE_VARIED * along,
+            *((_GAP_NEAR if gap < _NEAR else _GAP_FAR) * n for gap, n in counts),
+        ]
+        prior = float(-np.log(len(candidates))) - _SCORE_WEIGHT * max(
+            0.0, top - c.score - _SCORE_NOISE
+        )
+        trials: list[tuple[Kind, int, float, list[Array]]] = [
+            ("type", -1, float(np.log(1 - PRIOR_UNKNOWN)), []),
+            ("scaled", -1, float(np.log(PRIOR_UNKNOWN / 2)), scaled),
+            ("varied", -1, float(np.log(PRIOR_UNKNOWN / 2)), varied),
+        ]
+        for k in range(1, channels):
+            effect = np.zeros((channels, axles))
+            effect[k] = _CLOCK_S * abs(c.fit.motion.speed)
+            trials.append(("clock", k, float(np.log(PRIOR_CLOCK)), [effect]))
+        for kind, channel, log_prior, more in trials:
+            log, motion = _model(c, noise, [*base, *more])
+            if motion.speed > 0:
+                found.append((log + prior + log_prior, index, kind, channel, motion))
+    if not found:
+        return []
+    logs = np.array([f[0] for f in found])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    out = [
+        Explanation(index, kind, float(w), motion, channel)
+        for w, (_, index, kind, channel, motion) in zip(weights, found, strict=True)
+    ]
+    return sorted(out, key=lambda e: -e.probability)
+
+
+def half_interval(
+    parts: Sequence[tuple[float, float, float]], centre: float, share: float = 0.95
+) -> float:
+    """Half the width of the interval about ``centre`` that holds ``share`` of a mixture.
+
+    Args:
+        parts: (probability, mean, sigma).
+        centre: of the interval.
+        share: of the probability.
+    """
+    weight, mean, sigma = (np.array(column) for column in zip(*parts, strict=True))
+    sigma = np.maximum(sigma, 1e-12)
+    low, high = 0.0, float(np.max(np.abs(mean - centre) + 8 * sigma))
+    for _ in range(60):
+        half = 0.5 * (low + high)
+        inside = ndtr((centre + half - mean) / sigma) - ndtr((centre - half - mean) / sigma)
+        if float(np.sum(weight * inside) / weight.sum()) < share:
+            low = half
+        else:
+            high = half
+    return high
