@@ -24,6 +24,10 @@ def test_every_case_is_a_scenario_that_can_be_run() -> None:
             assert len(scenario.train[0].vehicles) == case.cars
         if case.spans:
             assert len(scenario.line.spans) == case.spans
+        if case.start is not None:
+            assert {train.start for train in scenario.train} == {case.start}
+        times = [train.start_time for train in scenario.train]
+        assert times == [times[0] + case.headway * number for number in range(case.trains)]
         for name, value in case.solution.items():
             assert getattr(scenario.solution, name) == value
 

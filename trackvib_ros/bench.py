@@ -60,6 +60,8 @@ class Case:
         scenario: scenario preset.
         cars: CRH3 cars that replace its train; 0 keeps it.
         spans: number of 32 m spans; 0 keeps the line.
+        start: position of the first wheelset at t = 0 (m); None keeps the scenario's.
+        trains: how many of the train run, ``headway`` (s) apart.
         solution: entries of ``[solution]`` that differ.
         sensors: whether the virtual accelerometers are run and timed too.
         reference: case that cost is compared with (ratio).
@@ -72,6 +74,9 @@ class Case:
     scenario: str
     cars: int = 0
     spans: int = 0
+    start: float | None = None
+    trains: int = 1
+    headway: float = 0.0
     solution: Mapping[str, Any] = field(default_factory=dict)
     sensors: bool = False
     reference: str = ""
@@ -125,10 +130,15 @@ def load_cases() -> list[Case]:
 def scenario_of(case: Case) -> Scenario:
     """The scenario that a case runs."""
     scenario = load_scenario(case.scenario)
-    first = scenario.train[0]
+    train = scenario.train[0]
     if case.cars:
-        cars = first.model_copy(update={"vehicles": first.vehicles[:1] * case.cars, "preset": None})
-        scenario = scenario.model_copy(update={"train": (cars,)})
+        cars = train.vehicles[:1] * case.cars
+        train = train.model_copy(update={"vehicles": cars, "preset": None})
+    if case.start is not None:
+        train = train.model_copy(update={"start": case.start})
+    times = [train.start_time + number * case.headway for number in range(case.trains)]
+    trains = tuple(train.model_copy(update={"start_time": time}) for time in times)
+    scenario = scenario.model_copy(update={"train": trains})
     if case.spans:
         line = scenario.line.model_copy(update={"spans": (32.0,) * case.spans})
         scenario = scenario.model_copy(update={"line": line})

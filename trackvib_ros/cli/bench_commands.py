@@ -39,7 +39,7 @@ def bench(
     """Measure how fast runs are: cost against the paper's way, error, growth, memory.
 
     Every case runs on one core in a process of its own; costs are CPU time, preparation excluded.
-    Groups: accuracy, product, cars, spans.
+    Groups: accuracy, product, cars, spans, duration.
     """
     from trackvib_ros.bench import growth, load_cases, run_cases
 
