@@ -146,36 +146,43 @@ def modal_tables(
         order: 1 or 2, interpolation of the forces in time.
         precision: of the shapes of rail and channels.
     """
-    modes = len(line.eigenvalues)
     root = np.sqrt(line.weights)
     cells = len(line.rail_shapes)
-    shapes = line.rail_shapes * root
     lam = line.eigenvalues
     decay, now, last, before = exponential_weights(lam, step, order)
     recall = -before / decay
 
-    packed = pack(shapes, precision).reshape(cells, 4, -1)
-
-    ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
-    slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
-    (v0, v1), (d0, d1) = (ends**2 @ now).real, (2 * ends * slopes @ now).real
-    own = np.stack([v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1)
-
     channel = line.channel_shapes * root
-    weights, feeds = [], []
-    for derivative in derivatives:
-        observe = channel * lam**derivative
-        weights.append(observe)
-        direct = channel * lam if derivative == 2 else 0.0 * channel
-        feeds.append(((observe * now + direct).T, (observe * recall).T))
     outputs = len(derivatives) * len(channel)
-    channel_weights = aligned((outputs, packed.shape[2]), precision)
+    observe = [channel * lam**derivative for derivative in derivatives]
+    direct = [channel * lam * (derivative == 2) for derivative in derivatives]
+    feeds = [
+        np.concatenate([np.zeros((0, len(lam))), *rows]).T
+        for rows in (
+            [one * now + other for one, other in zip(observe, direct, strict=True)],
+            [one * recall for one in observe],
+        )
+    ]
+    width = pack(lam).size
+    channel_weights = aligned((outputs, width), precision)
     channel_feed = np.zeros((2, cells, 4, outputs))
     if outputs:
-        channel_weights[:] = pack(np.concatenate(weights)).reshape(outputs, -1)
-        for row in range(2):
-            matrix = np.concatenate([feed[row] for feed in feeds], axis=1)
-            channel_feed[row] = (shapes.reshape(-1, modes) @ matrix).real.reshape(cells, 4, outputs)
+        channel_weights[:] = pack(np.concatenate(observe)).reshape(outputs, -1)
+    packed, own = aligned((cells, 4, width), precision), np.empty((cells, 4))
+    for begin in range(0, cells, 32):
+        part = slice(begin, begin + 32)
+        # by parts, because fresh memory costs more than this arithmetic
+        shapes = line.rail_shapes[part] * root
+        packed[part] = pack(shapes, precision).reshape(len(shapes), 4, width)
+        ends = np.stack([shapes[:, 0], shapes.sum(axis=1)])
+        slopes = np.stack([shapes[:, 1], shapes[:, 1] + 2 * shapes[:, 2] + 3 * shapes[:, 3]])
+        (v0, v1), (d0, d1) = (ends**2 @ now).real, (2 * ends * slopes @ now).real
+        own[part] = np.stack(
+            [v0, d0, 3 * (v1 - v0) - 2 * d0 - d1, 2 * (v0 - v1) + d0 + d1], axis=-1
+        )
+        for row, feed in enumerate(feeds):
+            answer = (shapes.reshape(-1, len(lam)) @ feed).real
+            channel_feed[row, part] = answer.reshape(len(shapes), 4, outputs)
     return ModalTables(
         shapes=packed,
         decay=pack(decay),
