@@ -179,6 +179,8 @@ def test_below_the_first_local_mode_the_balance_is_refused(rail: FreeRail) -> No
 def test_repaired_form_against_the_ensemble(loss: float, samples: int) -> None:
     """End-driven (index 0) and driven inside the span (index 1): 0.35 dB and 0.6 dB.
 
+    Asked for |w|^2 below an overlap of 0.15 are 2 dB; about 0.65 dB are reached there.
+
     The five frequencies of a band are hardly independent at low overlap: noise counts them as one.
     """
     for band in ensemble_study(loss, samples=samples):

@@ -56,7 +56,7 @@ def validate(
     ] = 8,
     samples: Annotated[
         int, typer.Option("--samples", help="Members of every Monte-Carlo ensemble.")
-    ] = 1000,
+    ] = 2000,
     crossover: Annotated[
         float | None, typer.Option("--crossover", help="Crossover f_g in Hz; unset: chosen.")
     ] = None,
