@@ -232,7 +232,11 @@ def run(create: Callable[[Stop], Any], arguments: Sequence[str] | None = None) -
     left to ``ros2 lifecycle`` or a launch file.
     """
     stop = Stop()
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except RCLError as error:
+        print(f"--ros-args: {error}", file=sys.stderr)
+        return 2
     node = create(stop)
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -150,12 +150,17 @@ class Processes:
         search = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         return self.start(*arguments, program=str(path), PATH=search)
 
-    def node(self, name: str, **parameters: object) -> subprocess.Popen[str]:
+    def node(
+        self, name: str, *, namespace: str = "", ROS_DOMAIN_ID: str = "", **parameters: object
+    ) -> subprocess.Popen[str]:
         arguments = ["-m", "trackvib_ros.start", name, "--ros-args", "-p", "autostart:=true"]
+        if namespace:
+            arguments += ["-r", f"__ns:=/{namespace}", "-r", "/clock:=clock"]
         for key, setting in parameters.items():
             text = str(setting).lower() if isinstance(setting, bool) else str(setting)
             arguments += ["-p", f"{key}:={text}"]
-        return self.start(*arguments)
+        domain = ROS_DOMAIN_ID or os.environ["ROS_DOMAIN_ID"]
+        return self.start(*arguments, ROS_DOMAIN_ID=domain)
 
     def close(self) -> None:
         for process in self._started:

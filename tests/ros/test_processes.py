@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +78,9 @@ def test_killed_detector_is_missed_by_the_sensor_which_goes_on(
     graph: Graph, processes: Processes
 ) -> None:
     diagnostics = graph.listen(m.DIAGNOSTICS)
-    sensor = processes.command("sensor", "--scenario", SCENARIO, "--headway", "1")
-    detector = processes.command("detect")
+    place = ("--namespace", "north")
+    sensor = processes.command("sensor", "--scenario", SCENARIO, "--headway", "1", *place)
+    detector = processes.command("detect", *place)
 
     def blocks() -> int:
         return int(figures(diagnostics, "detector: input").get("blocks rail/waveform", "0"))
@@ -107,69 +108,56 @@ def test_killed_detector_is_missed_by_the_sensor_which_goes_on(
     assert status == 0, text
 
 
-def test_domains_keep_two_sites_apart(
-    graph: Graph, processes: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same names in two ROS domains on one machine, at once."""
-    own = int(os.environ["ROS_DOMAIN_ID"])
-    foreign = own + 70
-    other = tmp_path / "other.toml"
-    other.write_text(QUICK.read_text(encoding="utf-8").replace("200 km/h", "120 km/h"))
-    neighbour = Graph(foreign)
-    try:
-        heard = [site.listen(m.TRAIN_EVENTS) for site in (graph, neighbour)]
-        clocks = [site.listen(m.CLOCK) for site in (graph, neighbour)]
-        for domain, scenario in ((own, SCENARIO), (foreign, str(other))):
-            monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-            processes.node("detector", use_sim_time=True)
-            processes.node("sensor", scenario=scenario, real_time_factor=0.0, await_detectors=1)
-
-        def both_heard() -> bool:
-            neighbour.once()
-            return all(passages(events) for events in heard)
-
-        graph.until(both_heard, "a passage in both domains")
-        for site, events, clock, speed in zip(
-            (graph, neighbour), heard, clocks, (200, 120), strict=True
-        ):
-            (passage,) = passages(events)
-            # loose: whose train it is matters here, how well it is measured does not
-            assert passage.values["speed"].value * 3.6 == pytest.approx(speed, rel=0.1)
-            names = [name for name, _ in site.tester.get_node_names_and_namespaces()]
-            assert sorted(names) == ["detector", "sensor", "tester"]
-            assert site.tester.count_publishers("/clock") == 1
-            times = [m.from_stamp(message.clock) for message in clock]
-            assert times == sorted(times)
-    finally:
-        neighbour.close()
-
-
-def test_namespaces_keep_two_sites_apart(
+def test_namespaces_and_domains_keep_sites_apart(
     graph: Graph, processes: Processes, tmp_path: Path
 ) -> None:
-    other = tmp_path / "other.toml"
-    other.write_text(QUICK.read_text(encoding="utf-8").replace("200 km/h", "120 km/h"))
-    heard: dict[str, list[Any]] = {}
-    clocks: dict[str, list[Any]] = {}
-    detectors: dict[str, Any] = {}
-    for site, scenario in (("north", SCENARIO), ("south", str(other))):
-        heard[site] = graph.listen(m.TRAIN_EVENTS, f"/{site}/{m.TRAIN_EVENTS.name}")
-        clocks[site] = graph.listen(m.CLOCK, f"/{site}/clock")
-        processes.command("sensor", "-s", scenario, "-n", site, "--real-time-factor", "2")
-        detectors[site] = processes.command("detect", "-n", site, "-o", str(tmp_path / site))
-    found: Callable[[str], list[Any]] = lambda site: passages(heard[site])  # noqa: E731
-    graph.until(lambda: found("north") and found("south"), "a passage at both sites")
-    speeds = {site: found(site)[0].values["speed"].value * 3.6 for site in heard}
-    # loose: whose train it is matters here, how well it is measured does not
-    assert speeds["north"] == pytest.approx(200, rel=0.1)
-    assert speeds["south"] == pytest.approx(120, rel=0.1)
-    assert len(found("north")) == len(found("south")) == 1
-    for site in heard:
-        times = [m.from_stamp(message.clock) for message in clocks[site]]
-        assert times == sorted(times)
-        detectors[site].send_signal(signal.SIGINT)
-        assert ended(detectors[site]) == (0, "")
-        bag = BagReader(tmp_path / site)
-        assert f"/{site}/clock" in bag.topics
+    """Two namespaces of one domain, and one of these names in another domain, at once."""
+    own = int(os.environ["ROS_DOMAIN_ID"])
+    neighbour = Graph(own + 70)
+    sites = {
+        (graph, own, "north"): 200,
+        (graph, own, "south"): 120,
+        (neighbour, own + 70, "north"): 160,
+    }
+    try:
+        heard, clocks = {}, {}
+        for site, speed in sites.items():
+            tester, domain, name = site
+            scenario = tmp_path / f"{speed}.toml"
+            scenario.write_text(
+                QUICK.read_text(encoding="utf-8").replace("200 km/h", f"{speed} km/h")
+            )
+            heard[site] = tester.listen(m.TRAIN_EVENTS, f"/{name}/{m.TRAIN_EVENTS.name}")
+            clocks[site] = tester.listen(m.CLOCK, f"/{name}/clock")
+            place = {"namespace": name, "ROS_DOMAIN_ID": str(domain)}
+            recorded = {"record_directory": tmp_path / "bag"} if name == "south" else {}
+            detector = processes.node("detector", use_sim_time=True, **recorded, **place)
+            processes.node(
+                "sensor", scenario=scenario, real_time_factor=0.0, await_detectors=1, **place
+            )
+            if recorded:
+                recording = detector
+
+        def all_heard() -> bool:
+            neighbour.once()
+            return all(passages(events) for events in heard.values())
+
+        graph.until(all_heard, "a passage at every site")
+        for site, speed in sites.items():
+            (passage,) = passages(heard[site])
+            # loose: whose train it is matters here, how well it is measured does not
+            assert passage.values["speed"].value * 3.6 == pytest.approx(speed, rel=0.1)
+            times = [m.from_stamp(message.clock) for message in clocks[site]]
+            assert times == sorted(times)
+        for tester, names in ((graph, ("north", "south")), (neighbour, ("north",))):
+            wanted = [(node, f"/{name}") for name in names for node in ("detector", "sensor")]
+            found = tester.tester.get_node_names_and_namespaces()
+            assert sorted(found) == sorted([*wanted, ("tester", "/")])
+            assert "/clock" not in dict(tester.tester.get_topic_names_and_types())
+        recording.send_signal(signal.SIGINT)
+        assert ended(recording) == (0, "")
+        bag = BagReader(tmp_path / "bag")
+        assert "/south/clock" in bag.topics
         assert bag.end_ns < 60_000_000_000  # logged in the simulated time of the site
-    assert "/clock" not in dict(graph.tester.get_topic_names_and_types())
+    finally:
+        neighbour.close()
