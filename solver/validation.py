@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .hybrid import crossover_frequency
-from .reference import extrapolated_run
+from .reference import Histories, extrapolated_run
 from .scenario import Scenario, build_scenario, load_scenario
 from .simulation import Simulation
 from .statistics import (
@@ -469,6 +469,7 @@ def compare_reference(
     scenario: Scenario | None = None,
     step: float = 6.25e-6,
     edges: tuple[float, ...] = REFERENCE_EDGES,
+    theirs: Histories | None = None,
 ) -> list[Agreement]:
     """``fe`` against :func:`solver.reference.extrapolated_run`, sample by sample.
 
@@ -479,11 +480,12 @@ def compare_reference(
         scenario: see :func:`reference_scenario`.
         step: larger step of the second method (s), a whole part of the scenario's.
         edges: low-pass edges (Hz).
+        theirs: histories of the second method at ``step``, if they are there already.
     """
     scenario = reference_scenario() if scenario is None else scenario
     simulation = Simulation(scenario, outputs=("displacement", "velocity", "acceleration"))
     block = simulation.advance(simulation.end_index)
-    theirs = extrapolated_run(scenario, step)
+    theirs = extrapolated_run(scenario, step) if theirs is None else theirs
     ratio = round(scenario.solution.step / step)
     rows = []
     for edge in edges:
