@@ -7,6 +7,7 @@ Local set: :mod:`solver.local`. Both add up at the rate that was asked for.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -17,11 +18,18 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .irregularity import Profile, build_profile
 from .line import LAYER_LIMIT, assemble
-from .local import LocalField, LocalWheel, contact_stiffness, local_wheel, low_pass
+from .local import (
+    LocalField,
+    LocalWheel,
+    contact_stiffness,
+    local_wheel,
+    low_pass,
+    with_tones,
+)
 from .modal import ModalRun, modal_run
 from .motion import TrainMotion
 from .newmark import NewmarkRun
-from .scenario import Scenario, Train
+from .scenario import Polygon, Scenario, Train
 from .traffic import Running, Traffic
 from .waves import Real, pinned_pinned_frequency, rail_frequency
 
@@ -88,6 +96,13 @@ def crossover_frequency(scenario: Scenario) -> float:
     return float(chosen)
 
 
+Tone = tuple[float, float, float]
+"""Wavenumber (rad/m), amplitude (m) and phase (rad) of amplitude * cos(wavenumber x + phase)."""
+
+WheelKey = tuple[tuple[float, bool, float, float], tuple[Tone, ...]]
+"""Speed, direction, mass and contact stiffness of a wheelset; its polygons."""
+
+
 class GlobalTraffic(Traffic):
     """Trains on the irregularity below the crossover."""
 
@@ -124,25 +139,47 @@ class GlobalTraffic(Traffic):
         speeds = set(self._speeds.values())
         self._parts = {k: v for k, v in self._parts.items() if k in speeds}
 
+    def low_profile(self, speed: float) -> Profile:
+        """The irregularity below the crossover at a speed (m/s), kept for later."""
+        profile = self.full_profile
+        if speed not in self._parts:
+            self._parts[speed] = low_pass(profile, 2 * np.pi * self._crossover / speed)
+        return self._parts[speed]
+
     def roughness(self, units: Sequence[Running], position: Real, time: Real) -> Real:
         """(n, A) m, as :meth:`Traffic.roughness` but without what is local."""
-        profile = self.full_profile
-        whole = self._profile
+        whole = self.full_profile
         column = 0
         values = np.empty_like(position)
-        for running in units:
-            speed = self.speed(running.train)
-            if speed not in self._parts:
-                self._parts[speed] = low_pass(profile, 2 * np.pi * self._crossover / speed)
-            count = len(running.unit.wheelsets)
+        for train, group in itertools.groupby(units, key=lambda running: running.train):
+            members = list(group)
+            speed = self.speed(train)
+            count = sum(len(running.unit.wheelsets) for running in members)
             own = slice(column, column + count)
-            self._profile = self._parts[speed]
+            self._profile = self.low_profile(speed)
             try:
-                values[:, own] = super().roughness([running], position[:, own], time)
+                values[:, own] = super().roughness(members, position[:, own], time)
             finally:
                 self._profile = whole
             column += count
         return values
+
+    def add(self, train: Train, now: int = 0) -> int:
+        """See :meth:`Traffic.add`; polygons above the crossover are left out."""
+        high = high_polygons(train, self._crossover, self.scenario.line.length)
+        low = tuple(polygon for polygon in train.polygon if polygon not in high)
+        return super().add(train.model_copy(update={"polygon": low}), now)
+
+
+def polygon_frequency(train: Train, polygon: Polygon, length: float) -> float:
+    """Frequency (Hz) at which a polygon shakes its wheelset on a line of ``length`` (m)."""
+    radius = _radii(train)[polygon.wheelset - 1]
+    return polygon.order * line_speed(TrainMotion(train), length) / (2 * math.pi * radius)
+
+
+def high_polygons(train: Train, crossover: float, length: float) -> list[Polygon]:
+    """Polygons of a train above the crossover (Hz)."""
+    return [p for p in train.polygon if polygon_frequency(train, p, length) > crossover]
 
 
 def line_speed(motion: TrainMotion, length: float) -> float:
@@ -236,8 +273,8 @@ class HybridRun:
         balance: balance the energy of the global set, see :class:`Simulation`.
 
     Raises:
-        InputError: see :func:`crossover_frequency`; a wheel flat, or a polygon above the
-            crossover: an impact is not a stationary random force.
+        InputError: see :func:`crossover_frequency`; a wheel flat: an impact is not a stationary
+            force; a polygon above the frequency limit.
 
     Attributes:
         crossover: f_g (Hz).
@@ -290,7 +327,7 @@ class HybridRun:
         self._buffer_signal = np.zeros((0, len(derivatives) * self._channels))
         self._local = np.zeros((0, len(derivatives), int(self.field.heard.sum())))
         self._local_first = 0
-        self._wheels: dict[tuple[float, bool, float, float], LocalWheel] = {}
+        self._wheels: dict[WheelKey, LocalWheel] = {}
         self._tables: list[LocalWheel] = []
         self._kinds = np.zeros(0, dtype=np.intp)
         self._describe_wheels()
@@ -356,32 +393,32 @@ class HybridRun:
             InputError: see :class:`HybridRun`.
         """
         motion = TrainMotion(train)
-        speed = line_speed(motion, self.scenario.line.length)
+        line_speed(motion, self.scenario.line.length)
         if train.flat:
             raise InputError(
                 f"train.flat on wheelset {train.flat[0].wheelset}: the impact of a flat is no "
                 'stationary random force, which the hybrid needs: set solution.model = "fe"'
             )
+        limit = self.scenario.solution.frequency_limit
         for polygon in train.polygon:
-            radius = _radii(train)[polygon.wheelset - 1]
-            frequency = polygon.order * speed / (2 * math.pi * radius)
-            if frequency > self.crossover:
+            frequency = polygon_frequency(train, polygon, self.scenario.line.length)
+            if frequency > limit:
                 raise InputError(
                     f"train.polygon of order {polygon.order} on wheelset {polygon.wheelset}: "
-                    f"{frequency:.0f} Hz lies above the hybrid's crossover {self.crossover:.0f} "
-                    'Hz, where forces are random: set solution.model = "fe", or a higher '
-                    "solution.crossover"
+                    f"{frequency:.0f} Hz lies above solution.frequency_limit = {limit:g} Hz: lower "
+                    "the order or the speed"
                 )
 
     def _describe_wheels(self) -> None:
-        """Local force tables: one per speed, direction, wheelset mass and contact stiffness."""
+        """Local force tables: one per speed, direction, mass, contact stiffness and polygons."""
         profile = self._traffic.full_profile
-        columns: list[tuple[float, bool, float, float]] = []
+        columns: list[WheelKey] = []
         for running in self._traffic.running:
             if running.train not in self._traffic.arranged:
                 continue
             motion = self._traffic.motions[running.train]
             speed = self._traffic.speed(running.train)
+            self._traffic.low_profile(speed)
             loads = running.unit.static_loads
             for axle, index in enumerate(running.unit.wheelsets):
                 stiffness = contact_stiffness(
@@ -390,25 +427,38 @@ class HybridRun:
                     round(float(loads[axle]), 3),
                 )
                 mass = float(running.unit.mass[index, index])
-                columns.append((speed, motion.sign > 0, mass, stiffness))
+                tones = self._tones(running.train, running.axles.start + axle)
+                columns.append(((speed, motion.sign > 0, mass, stiffness), tones))
         unused = [key for key in self._wheels if key not in columns]
         for key in unused[: max(0, len(self._wheels) - KEPT_TABLES)]:
             del self._wheels[key]
         for key in columns:
             if key not in self._wheels:
                 self._wheels[key] = local_wheel(
-                    profile,
+                    with_tones(profile, key[1]),
                     self.field.cells,
                     self.field.tables.receptances,
                     self.field.edges,
                     self.scenario.track.fastening.spacing,
-                    *key,
+                    *key[0],
                     self._traffic.length,
                 )
         order = list(self._wheels)
         self._tables = [self._wheels[key] for key in order]
         self._kinds = np.array([order.index(key) for key in columns], dtype=np.intp)
         self.field.use(self._tables)
+
+    def _tones(self, index: int, axle: int) -> tuple[Tone, ...]:
+        """Polygons of a wheelset above the crossover, as waves of the rail it runs on."""
+        motion = self._fine.motions[index]
+        train, tones = motion.train, []
+        for polygon in high_polygons(train, self.crossover, self.scenario.line.length):
+            if polygon.wheelset == axle + 1:
+                wavenumber = polygon.order / _radii(train)[axle]
+                rolled = float(motion.offsets[axle]) - motion.sign * train.start
+                phase = motion.sign * wavenumber * rolled
+                tones.append((wavenumber, polygon.amplitude, phase))
+        return tuple(tones)
 
     @property
     def next_sample(self) -> int:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -100,6 +100,26 @@ def low_pass(profile: Profile, wavenumber: float) -> Profile:
     spectrum = spectrum * np.sin(0.5 * np.pi * gain) ** 2
     stride = max(1, int(2 * math.pi / wavenumber / 10 / profile.step))
     return _sampled(profile, spectrum, k, stride)
+
+
+def with_tones(profile: Profile, tones: Sequence[tuple[float, float, float]]) -> Profile:
+    """A profile plus waves, on a grid of at least ten points a wave.
+
+    Args:
+        profile: irregularity (m).
+        tones: (wavenumber rad/m, amplitude m, phase rad) of amplitude * cos(wavenumber x + phase).
+    """
+    if not tones:
+        return profile
+    finest = 2 * math.pi / max(wavenumber for wavenumber, _, _ in tones) / 10
+    parts = max(1, math.ceil(profile.step / finest))
+    step = profile.step / parts
+    x = profile.start + step * np.arange((len(profile.value) - 1) * parts + 1)
+    value, slope = profile(x), np.gradient(profile(x), step)
+    for wavenumber, amplitude, phase in tones:
+        value = value + amplitude * np.cos(wavenumber * x + phase)
+        slope = slope - amplitude * wavenumber * np.sin(wavenumber * x + phase)
+    return Profile(profile.start, step, value, slope)
 
 
 def _spectrum(profile: Profile) -> tuple[Complex, Real]:
