@@ -8,10 +8,16 @@ import time
 
 import pytest
 
-from solver import InputError, load_scenario_text, preset_text
+from solver import InputError
 from trackvib_ros.dataset import make_dataset
 from trackvib_ros.dataset_spec import Spec
 
+SHORT = """
+line = { approach_left = 10.0, spans = [20.0], approach_right = 10.0 }
+solution = { frequency_limit = 500.0, step = 2.5e-4 }
+channel = [{ name = "rail_a", layer = "rail", x = 10.0 }]
+sensor = [{ channel = "rail_a", preset = "rail_500g", rate = 1000, bandwidth = 400.0 }]
+"""
 TABLE = {
     "scenarios": ["short.toml"],
     "trains": ["metro"],
@@ -41,10 +47,7 @@ def test_address_needs_a_port(tmp_path):
     reason="needs Dask: pip install '.[cluster]'",
 )
 def test_a_killed_worker_loses_and_doubles_nothing(tmp_path):
-    demo = load_scenario_text(preset_text("demo"), "demo")
-    solution = demo.solution.model_copy(update={"frequency_limit": 600.0})
-    short = demo.model_copy(update={"solution": solution})
-    (tmp_path / "short.toml").write_text(short.to_toml(), "utf-8")
+    (tmp_path / "short.toml").write_text(SHORT, "utf-8")
     spec = Spec.from_table(TABLE, "set.toml", tmp_path)
     elsewhere = tmp_path / "elsewhere"  # the workers' folder is not the client's
     elsewhere.mkdir()
