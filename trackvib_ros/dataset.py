@@ -9,6 +9,7 @@ another processor, numbers differ in their last digits.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import uuid
@@ -210,7 +211,11 @@ def _write(
         **custom_data,
     }
     latched = Qos(durability="transient_local")
-    writer = BagWriter(directory, custom_data=custom, queue_bytes=1 << 40)
+    # no flush by the clock: on a busy machine it would cut chunks elsewhere, and the bag would not
+    # be the same again
+    writer = BagWriter(
+        directory, custom_data=custom, queue_bytes=1 << 40, flush_interval_s=math.inf
+    )
 
     def topic(name: str, kind: str, qos: Qos) -> str:
         full = f"/{name}"

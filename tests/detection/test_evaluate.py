@@ -1,8 +1,10 @@
 """Scores on hand-made events whose result is known, and one bag from the solver to the table."""
 
+import itertools
 import json
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +13,9 @@ from typer.testing import CliRunner
 
 from solver import InputError, TrainMotion, load_scenario_text
 from trackvib_ros.accuracy import Accuracy, views_for
+from trackvib_ros.bag import BagWriter
 from trackvib_ros.cli import _register, app
-from trackvib_ros.dataset import make_dataset
+from trackvib_ros.dataset import make_dataset, write_bag
 from trackvib_ros.dataset_spec import EXAMPLE, Spec, tomllib
 from trackvib_ros.detection import Catalogue, Channel, Estimate, TrainEvent
 from trackvib_ros.evaluate import (
@@ -445,6 +448,27 @@ def test_signal_to_noise_ratio_is_that_of_the_samples(tmp_path):
 
 def bytes_of(bag):
     return {path.name: path.read_bytes() for path in bag.iterdir()}
+
+
+def test_bytes_of_a_bag_do_not_depend_on_the_clock(tmp_path, monkeypatch):
+    cases = spec(**SMALL, trains=["metro"])
+    scenario = cases.scenario_of(cases.expand()[0])
+    still = np.random.default_rng(1).standard_normal((8_000, 2))
+    write_bag(scenario, tmp_path / "a" / "bag", acceleration=still)
+    # a machine so busy that every message waits for the last one to be written, 10 s later
+    ticks = itertools.count(step=10.0)
+    monkeypatch.setattr("trackvib_ros.bag.writer.time.monotonic", lambda: next(ticks))
+    write = BagWriter.write
+
+    def slowly(writer, *message):
+        write(writer, *message)
+        deadline = time.perf_counter() + 20
+        while writer._queue:
+            assert time.perf_counter() < deadline, "the writer stands still"
+
+    monkeypatch.setattr(BagWriter, "write", slowly)
+    write_bag(scenario, tmp_path / "b" / "bag", acceleration=still)
+    assert bytes_of(tmp_path / "a" / "bag") == bytes_of(tmp_path / "b" / "bag")
 
 
 def test_dataset_is_resumed_scored_and_made_again(tmp_path):
