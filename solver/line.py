@@ -11,8 +11,8 @@ of one rail are doubled. Displacement is positive down, forces compress positive
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -148,6 +148,9 @@ class Structure:
         valid_band: highest frequency (Hz) up to which each layer's mesh resolves its own
             bending waves, at most the frequency limit.
         supports: force of every bearing, numbered 2 * span + end from 0.
+        cuts: where slab and support layer are severed (m).
+        bounds: left and right end of the rail (m) that the coordinates describe.
+        probes: of every channel, where the coordinates describe a part only.
     """
 
     scenario: Scenario
@@ -159,6 +162,9 @@ class Structure:
     fastenings: Array
     valid_band: Mapping[Layer, float]
     supports: Mapping[int, Probe]
+    cuts: tuple[float, ...]
+    bounds: tuple[float, float]
+    probes: Mapping[str, Probe] | None = None
 
     @property
     def size(self) -> int:
@@ -207,6 +213,8 @@ class Structure:
 
         Strain is positive in tension, ``-fibre * rotation'``; forces are positive in compression.
         """
+        if self.probes is not None:
+            return self.probes[channel.name]
         x = self.scenario.channel_x(channel)
         none = sp.csr_array((1, self.size))
         if channel.quantity == "motion":
@@ -222,7 +230,9 @@ class Structure:
                     f'channel "{channel.name}": fastening rows = 0 on the line; at least 1 needed'
                 )
             nearest = float(self.fastenings[np.argmin(np.abs(self.fastenings - x))])
-            rows, stiffness, damping = _fastening_rows(self.scenario, self.fields, nearest)
+            rows, stiffness, damping = _fastening_rows(
+                self.scenario, self.fields, nearest, self.cuts
+            )
             weights = np.ones((1, rows.shape[0]))
             return Probe(
                 sp.csr_array((weights * stiffness) @ rows),
@@ -236,6 +246,71 @@ class Structure:
         ends = [(abs(bounds[s][e] - x), 2 * s + e) for s in spans for e in (0, 1)]
         return self.supports[min(ends)[1]]
 
+    def part(self, number: int) -> Structure:
+        """Segment ``number`` of a severed line: its own coordinates and the joints to others.
+
+        Rows of places elsewhere are zero.
+        """
+        inside: dict[Layer, np.ndarray] = {}
+        bounds = (0.0, self.length)
+        for layer, beam in self.fields.items():
+            cuts = self.cuts
+            if layer == "rail":
+                cuts = tuple(rail_cut(self.scenario, x) for x in cuts)
+                bounds = [0.0, *cuts][number], [*cuts, self.length][number]
+            segment = np.searchsorted(cuts, (beam.left + beam.right) / 2)
+            inside[layer] = np.flatnonzero(segment == number)
+        tables = [self.fields[layer].dofs[i] for layer, chosen in inside.items() for i in chosen]
+        kept = np.unique(np.concatenate(tables))
+        kept = kept[kept >= 0]
+        position = np.full(self.size + 1, -1)
+        position[kept] = np.arange(len(kept))
+
+        def restrict(probe: Probe) -> Probe:
+            parts = (probe.displacement_rows, probe.velocity_rows, probe.acceleration_rows)
+            return Probe(*(sp.csr_array(rows[:, kept]) for rows in parts))
+
+        fields = {
+            layer: Field(
+                self.fields[layer].left[chosen],
+                tuple(self.fields[layer].elements[i] for i in chosen),
+                tuple(position[self.fields[layer].dofs[i]] for i in chosen),
+                len(kept),
+            )
+            for layer, chosen in inside.items()
+        }
+        return replace(
+            self,
+            mass=sp.csr_array(self.mass[kept][:, kept]),
+            damping=sp.csr_array(self.damping[kept][:, kept]),
+            stiffness=sp.csr_array(self.stiffness[kept][:, kept]),
+            fields=fields,
+            fastenings=self.fastenings[
+                (self.fastenings > bounds[0]) & (self.fastenings < bounds[1])
+            ],
+            supports={key: restrict(probe) for key, probe in self.supports.items()},
+            cuts=self.cuts[max(number - 1, 0) : number + 1],
+            bounds=bounds,
+            probes={c.name: restrict(self.probe(c)) for c in self.scenario.channel},
+        )
+
+    def joint_rows(self) -> sp.csr_array:
+        """Rows of deflection and rotation of the beams that end at cuts of this part: (J, N).
+
+        Rail, slab and support layer at the left cut, then at the right one.
+        """
+        numbers = []
+        for cut in self.cuts:
+            for layer in LAYERS[:3]:
+                beam = self.fields[layer]
+                x = rail_cut(self.scenario, cut) if layer == "rail" else cut
+                if abs(beam.left[0] - x) < 1e-6:
+                    numbers += list(beam.dofs[0][:2])
+                else:
+                    numbers += list(beam.dofs[-1][2:4])
+        size = len(numbers)
+        return sp.csr_array((np.ones(size), (range(size), numbers)), shape=(size, self.size))
+
     def channel_band(self, channel: Channel) -> float:
         """Valid band of a channel (Hz): what its layer and the rail that feeds it resolve."""
         return min(self.valid_band["rail"], self.valid_band[channel.layer])
@@ -248,8 +323,13 @@ class Structure:
         return self.rows(layer, x)
 
 
-def assemble(scenario: Scenario) -> Structure:
+def assemble(scenario: Scenario, cuts: Sequence[float] = ()) -> Structure:
     """Assemble the line of a scenario.
+
+    Args:
+        cuts: places (m) where slab and support layer are severed, and the rail in the same bay;
+            on a bridge they must be bearings. Nodes of both sides have their own coordinates
+            there, and nothing joins them (:mod:`segments` does).
 
     Raises:
         SolverError: the basis of an element is not independent in double precision.
@@ -257,7 +337,7 @@ def assemble(scenario: Scenario) -> Structure:
     track = scenario.track
     sections = beam_sections(track)
     fastenings = _fastening_positions(scenario)
-    meshes = {layer: _nodes(scenario, layer, fastenings) for layer in LAYERS}
+    meshes = {layer: _nodes(scenario, layer, fastenings, cuts) for layer in LAYERS}
     orders = {layer: _orders(scenario, layer, meshes[layer], sections[layer]) for layer in LAYERS}
     fields, dofs, size, held = _number(scenario, meshes, orders, sections)
 
@@ -274,7 +354,7 @@ def assemble(scenario: Scenario) -> Structure:
         full["stiffness"] += _gram(rows, stiff)
         full["damping"] += _gram(rows, damp)
     for x in fastenings:
-        rows, stiff, damp = _fastening_rows(scenario, fields, float(x))
+        rows, stiff, damp = _fastening_rows(scenario, fields, float(x), cuts)
         full["stiffness"] += _gram(rows, stiff)
         full["damping"] += _gram(rows, damp)
     bearing = track.bridge.bearing_stiffness
@@ -319,6 +399,8 @@ def assemble(scenario: Scenario) -> Structure:
             for layer in fields
         },
         supports,
+        tuple(cuts),
+        (0.0, scenario.line.length),
     )
 
 
@@ -352,22 +434,40 @@ def _spread(bounds: list[float], longest: float) -> list[float]:
     return nodes
 
 
-def _nodes(scenario: Scenario, layer: Layer, fastenings: Array) -> list[Array]:
+def _nodes(
+    scenario: Scenario, layer: Layer, fastenings: Array, cuts: Sequence[float]
+) -> list[Array]:
     """Node positions of a layer (m), one array per connected part."""
-    line, track = scenario.line, scenario.track
     if layer == "bridge":
-        return [np.array(bounds) for bounds in line.span_bounds]
+        return [np.array(bounds) for bounds in scenario.line.span_bounds]
+    if layer == "rail":
+        cuts = [rail_cut(scenario, x) for x in cuts]
+    nodes = _stops(scenario, layer, fastenings, cuts)
+    bounds = [nodes[0], *cuts, nodes[-1]]
+    return [np.array([a, *nodes[(nodes > a) & (nodes < b)], b]) for a, b in pairwise(bounds)]
+
+
+def rail_cut(scenario: Scenario, x: float) -> float:
+    """Where the rail is severed (m) when slab and layer are at ``x``: half-way along that bay."""
+    fastening = scenario.track.fastening
+    first = fastening.spacing / 2 if fastening.first_offset is None else fastening.first_offset
+    return first + fastening.spacing * (math.floor((x - first) / fastening.spacing) + 0.5)
+
+
+def _stops(scenario: Scenario, layer: Layer, fastenings: Array, cuts: Sequence[float]) -> Array:
+    """Node positions of a layer that runs through (m)."""
+    line, track = scenario.line, scenario.track
     ends = [0.0, line.length]
-    stops = sorted({*ends, *(x for bounds in line.span_bounds for x in bounds)})
+    stops = sorted({*ends, *cuts, *(x for bounds in line.span_bounds for x in bounds)})
     if scenario.solution.sines is not None:
-        return [np.array(stops)]
+        return np.array(stops)
     if layer == "rail" and track.rail.theory == "timoshenko":
         # the shear force jumps at a fastening, so the slope of the rail does too
         inner = fastenings[
             (fastenings > 1e-3 * track.fastening.spacing)
             & (fastenings < line.length - 1e-3 * track.fastening.spacing)
         ]
-        return [np.array([ends[0], *inner, ends[1]])]
+        return np.array(sorted([*ends, *inner, *cuts]))
     jumps = {
         x
         for variation in track.variation
@@ -377,9 +477,11 @@ def _nodes(scenario: Scenario, layer: Layer, fastenings: Array) -> list[Array]:
     stops = sorted({*stops, *jumps})
     kept = [stops[0]]
     for stop in stops[1:-1]:
-        if stop - kept[-1] > 0.2 and stops[-1] - stop > 0.2:
+        if stop in cuts and stop - kept[-1] <= 0.2:
+            kept.pop()
+        if stop in cuts or (stop - kept[-1] > 0.2 and stops[-1] - stop > 0.2):
             kept.append(stop)
-    return [np.array(_spread([*kept, stops[-1]], SLAB_ELEMENT))]
+    return np.array(_spread([*kept, stops[-1]], SLAB_ELEMENT))
 
 
 def _orders(
@@ -461,7 +563,8 @@ def _number(
                 if scenario.track.bridge.bearing_stiffness is None:
                     held += [first, last]
             elif scenario.line.ends == "pinned":
-                held += [first, last]
+                held += [first] if nodes[0] == 0 else []
+                held += [last] if nodes[-1] == scenario.line.length else []
             left += list(chain.left)
             elements += chain.elements
             tables += chain.dofs
@@ -566,7 +669,7 @@ def _beds(
 
 
 def _fastening_rows(
-    scenario: Scenario, fields: Mapping[Layer, Field], x: float
+    scenario: Scenario, fields: Mapping[Layer, Field], x: float, cuts: Sequence[float] = ()
 ) -> tuple[sp.csr_array, Array, Array]:
     """Compression rows of the fastening row at ``x`` with their stiffness and damping."""
     track = scenario.track
@@ -579,7 +682,10 @@ def _fastening_rows(
         at, share = at[inside], share[inside]
     else:
         at, share = np.array([x]), np.ones(1)
-    rows = sp.csr_array(fields["rail"].rows(at) - fields["slab"].rows(at))
+    # a pad that reaches over a cut bears on the slab of its own side
+    side = sum(x > rail_cut(scenario, cut) for cut in cuts)
+    over = np.clip(at, [-np.inf, *cuts][side], [*cuts, np.inf][side] - 1e-6)
+    rows = sp.csr_array(fields["rail"].rows(at) - fields["slab"].rows(over))
     row = np.array([x])
     stiffness = track.fastening.stiffness * _factor(track, "fastening.stiffness", row)
     damping = track.fastening.damping * _factor(track, "fastening.damping", row)

@@ -833,9 +833,10 @@ class ModalRun:
         self.line = line
         self._balance = balance
         self.traffic = traffic
-        self.tables = modal_tables(
-            line, traffic.step, derivatives, order=order, precision=precision
-        )
+        self._precision = precision
+        self._modal: Array = np.zeros(0)
+        self._load: NDArray[np.floating] = np.zeros(0)
+        self._prepare(derivatives, order)
         traffic.lay_ends(self._static_compliance)
         self.lost_contacts = 0
         self.equilibrium_residual = 0.0
@@ -845,13 +846,18 @@ class ModalRun:
         self._residual = one_sided_cubics(line.channel_residual)
         self._next = 0
         self._held: list[Array] = []
-        self._modal: Array = aligned(self.tables.decay.shape, np.float64)
-        self._load: NDArray[np.floating] = aligned(self.tables.decay.shape, precision)
         self._units: list[Running] = []
         self._loads: Array = np.zeros(0)
         self._fleet: Fleet | None = None
         self._steps: list[UnitStep] = []
         self._until = 0
+
+    def _prepare(self, derivatives: tuple[int, ...], order: int) -> None:
+        self.tables = modal_tables(
+            self.line, self.traffic.step, derivatives, order=order, precision=self._precision
+        )
+        self._modal = aligned(self.tables.decay.shape, np.float64)
+        self._load = aligned(self.tables.decay.shape, self._precision)
 
     def _static_compliance(self, place: Array) -> Array:
         line = self.line
@@ -919,7 +925,7 @@ class ModalRun:
         time: Array = (self._next + np.arange(samples, dtype=np.float64)) * self.traffic.step
         position = self.traffic.position(time)
         force = np.full(position.shape, np.nan)
-        outputs = np.empty((samples, len(self.tables.channel_weights)))
+        outputs = np.empty((samples, len(self._derivatives) * len(self.line.channel_x)))
         answer = np.zeros((samples, len(self.line.channel_x), 3))
         done = 0
         while done < samples:
@@ -1040,6 +1046,18 @@ class ModalRun:
             place,
         )
 
+    def _compliance(self, place: Array) -> Array:
+        """Static displacement of the rail at places (n,) m per force there: (n, n) m/N."""
+        shapes = self.line.rail(place)
+        compliance = (shapes * (-self.line.weights / self.line.eigenvalues) @ shapes.T).real
+        return np.asarray(compliance + np.diag(self.line.rail_residual(place)))
+
+    def _rest(self, place: Array, force: Array) -> None:
+        """Add the state at rest under forces (N) at places (m)."""
+        load = (self.line.rail(place) * np.sqrt(self.line.weights)).T @ force
+        self._load += pack(load)
+        self._modal += pack((self.tables.start_weights * load).conj())
+
     def _start(
         self, units: list[Running], position: Array, time: float
     ) -> tuple[list[Array], list[Array], list[Array]]:
@@ -1049,19 +1067,13 @@ class ModalRun:
         places = [position[unit.columns] for unit in units]
         place = np.concatenate(places)
         roughness = self.traffic.roughness(units, place[np.newaxis], np.array([time]))[0]
-        shapes = self.line.rail(place)
-        weights = self.line.weights
-        compliance = (shapes * (-weights / self.line.eigenvalues) @ shapes.T).real
         on_line = (place >= 0) & (place <= self.line.length)
-        compliance += np.diag(self.line.rail_residual(place))
+        compliance = self._compliance(place)
         whole = block_units([unit.unit for unit in units])
         law = np.concatenate([unit.law for unit in units], axis=1)
         rest, force = static_start(whole, law, compliance, roughness)
         if on_line.any():
-            load = (shapes * np.sqrt(weights)).T @ force
-            y = self.tables.start_weights * load
-            self._load += pack(load)
-            self._modal += pack(y.conj())
+            self._rest(place, force)
         states, forces, first, axle = [], [], 0, 0
         for unit in units:
             size, axles = len(unit.unit.weight), len(unit.unit.wheelsets)

@@ -8,7 +8,7 @@ With complex modes normalised to ``phi.T (2 lambda M + C) phi = 1`` the receptan
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 12
+FORMAT = 13
 
 RESIDUAL_REACH = 8.0
 """Distance (m) from a channel beyond which dropped modes do not answer a wheel; faded out over
@@ -41,6 +41,8 @@ CHANNEL_SHARE = 1e-2
 CONTACT_COMPLIANCE = 4e-10
 """Of the two contacts of a wheelset (m/N), in series with the rail's."""
 GRID_PHASE = 0.8
+JOINT_SHIFTS = (0.7, 1.0)
+"""Frequencies, in frequency limits, at which the answer of dropped modes at a cut is exact."""
 SIZE_LIMIT = 9000
 """Coordinates above which dense modes are refused: 2200 take 16 s on one core, time grows with
 the cube, memory with the square."""
@@ -73,6 +75,8 @@ class ModalLine:
         channel_band: (C,) valid band of each channel (Hz).
         length: of the line (m).
         solved: number of complex modes that were computed, K of them kept.
+        joint_shapes: (J, K); deflections and rotations of the layers at the cuts that bound a
+            segment, left cut first; (0, K) for a whole line.
     """
 
     eigenvalues: Complex
@@ -87,6 +91,7 @@ class ModalLine:
     channel_band: Array
     length: float
     solved: int
+    joint_shapes: Complex
 
     def rail(self, x: Array | float, derivative: int = 0) -> Complex:
         """Shapes of the rail (or their slope) at ``x`` (m), zero off the line: (len(x), K)."""
@@ -219,6 +224,10 @@ def reduced_modes(structure: Structure, limit: float) -> tuple[Array, Array]:
     added as residual vectors (MacNeal 1971), rotated into frequencies of their own. Without them
     the slab is 1 to 30 % wrong between 500 and 2000 Hz however many modes are kept.
 
+    Of the coordinates at the cuts of a segment the response of the dropped modes is added at
+    rest and at ``JOINT_SHIFTS`` of the frequency limit. What passes a cut is then
+    exact at these frequencies, to first order in the frequency squared.
+
     Raises:
         SolverError: the line has too many coordinates for a dense eigenproblem.
     """
@@ -233,15 +242,31 @@ def reduced_modes(structure: Structure, limit: float) -> tuple[Array, Array]:
     at = structure.fastenings
     points = sp.vstack([structure.rows("rail", at), structure.rows("slab", at)])
     residual = (points @ shapes[:, count:]).T / omega[count:, None]
-    left, size, _ = np.linalg.svd(residual, full_matrices=False)
-    left = left[:, size > RESIDUAL_TOLERANCE * size[0]] if len(size) else left
-    coordinates = left / omega[count:, None]
+    basis = _independent(residual)
+    if structure.cuts:
+        force = (structure.joint_rows() @ shapes[:, count:]).T
+        vectors = [basis]
+        for shift in (0.0, *JOINT_SHIFTS):
+            at_rest = omega[count:] ** 2
+            moving = (
+                at_rest - (2 * np.pi * shift * structure.scenario.solution.frequency_limit) ** 2
+            )
+            answer = force * (omega[count:] / moving)[:, None]
+            vectors.append(answer / np.linalg.norm(answer, axis=0))
+        basis = _independent(np.hstack(vectors))
+    coordinates = basis / omega[count:, None]
     compliance, rotation = np.linalg.eigh(coordinates.T @ coordinates)
     extra = shapes[:, count:] @ (coordinates @ rotation / np.sqrt(compliance))
     return (
         np.concatenate([omega[:count], 1 / np.sqrt(compliance)]),
         np.hstack([shapes[:, :count], extra]),
     )
+
+
+def _independent(vectors: Array) -> Array:
+    """Orthonormal basis of the columns, directions of little size left out."""
+    left, size, _ = np.linalg.svd(vectors, full_matrices=False)
+    return np.asarray(left[:, size > RESIDUAL_TOLERANCE * size[0]] if len(size) else left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,14 +287,18 @@ class LineForms:
 
 
 def build_modal_line(structure: Structure) -> ModalLine:
-    """Modal tables of a structure, computed."""
+    """Modal tables of a line or of a segment of one, computed."""
     return solve_modal_line(structure)[0]
 
 
 def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
-    """Modal tables of a structure, and what its energies need beside them."""
+    """Modal tables of a structure, and what its energies need beside them.
+
+    All modes of a segment are kept, because a truncated sum of complex modes need not be passive.
+    """
     scenario = structure.scenario
     limit = scenario.solution.frequency_limit
+    joints = structure.joint_rows()
     omega, real = reduced_modes(structure, REAL_MARGIN * limit)
     damping = real.T @ (structure.damping @ real)
     values, vectors, weights = complex_modes(omega, damping)
@@ -292,7 +321,9 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
             + (probe.velocity_rows @ real) @ vectors * values
             + (probe.acceleration_rows @ real) @ vectors * values**2
         )[0]
-    kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
+    kept = np.ones(solved, bool)
+    if not structure.cuts:
+        kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
     values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
     table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
     inverse = _flexibility(structure)
@@ -303,7 +334,7 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
     residual = np.empty((cells, 4))
     for begin in range(0, cells, 256):
         cell = slice(begin, begin + 256)
-        x = np.clip(places_in_cell[cell].ravel(), 0, structure.length)
+        x = np.clip(places_in_cell[cell].ravel(), *structure.bounds)
         at = structure.rail_rows(x)
         exact = np.asarray(at.multiply(at @ inverse).sum(axis=1)).ravel()
         exact += structure.missing_rail_compliance(x)
@@ -329,6 +360,7 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
         channel_band=np.array([structure.channel_band(c) for c in scenario.channel]),
         length=structure.length,
         solved=solved,
+        joint_shapes=joints @ real @ vectors,
     )
     return built, LineForms(omega, damping, vectors, limit)
 
@@ -382,12 +414,13 @@ def _channel_residual(
         rate = (probe.velocity_rows @ inverse)[0] - inverse @ (structure.damping @ static)
         for side, sign in enumerate((-1.0, 1.0)):
             loads = place + sign * reach
-            on = (loads >= 0) & (loads <= structure.length)
+            on = (loads >= structure.bounds[0]) & (loads <= structure.bounds[1])
             rows, shapes = structure.rail_rows(loads[on]), rail(loads[on])
             for order, exact in enumerate((0 * static, static, rate)):
                 kept = shapes @ (-weights * channels[number] / values**order)
                 result[number, order, side, on] = rows @ exact - kept.real
-            if channel.layer == "rail" and channel.quantity == "motion":
+            here = structure.bounds[0] <= place <= structure.bounds[1]
+            if here and channel.layer == "rail" and channel.quantity == "motion":
                 missing = structure.missing_rail_deflection(loads[on], place)
                 result[number, 1, side, on] += missing
     return result * fade
@@ -402,14 +435,14 @@ def _grid(structure: Structure) -> tuple[float, float, int]:
     spacing = scenario.track.fastening.spacing
     step = spacing / (2 * math.ceil(spacing * wavenumber / GRID_PHASE / 2))
     first = float(structure.fastenings[0]) if len(structure.fastenings) else 0.0
-    start = first - step * math.ceil(first / step - 1e-9)
-    return start, step, math.ceil((structure.length - start) / step - 1e-9)
+    left, right = structure.bounds
+    start = first - step * math.ceil((first - left) / step - 1e-9)
+    return start, step, math.ceil((right - start) / step - 1e-9)
 
 
 def _cubics(structure: Structure, real: Array, edges: Array) -> Array:
     """Cubic coefficients of the real rail shapes over every cell: (cells, 4, n)."""
-    length = structure.length
-    a, b = np.clip(edges[:-1], 0, length), np.clip(edges[1:], 0, length)
+    a, b = np.clip(edges[:-1], *structure.bounds), np.clip(edges[1:], *structure.bounds)
     field, h = structure.fields["rail"], (b - a)[:, None]
     # slopes are taken just inside the cell: the rail may have a kink at its edge
     inner = 1e-7 * (b - a)
@@ -439,10 +472,21 @@ def modal_line(scenario: Scenario) -> ModalLine:
     Raises:
         SolverError: see :func:`real_modes` and :func:`complex_modes`.
     """
-    return cached(_cache_key(scenario), ModalLine, lambda: build_modal_line(assemble(scenario)))
+    return cached_line(scenario, lambda: build_modal_line(assemble(scenario)))
 
 
-def _cache_key(scenario: Scenario) -> dict[str, object]:
+def cached_line(
+    scenario: Scenario, solve: Callable[[], ModalLine], part: Sequence[float] = ()
+) -> ModalLine:
+    """What ``solve`` gives, from the disk cache when it was solved before.
+
+    Args:
+        part: numbers (m) that tell this segment from others of the same line.
+    """
+    return cached(_cache_key(scenario, part), ModalLine, solve)
+
+
+def _cache_key(scenario: Scenario, segment: Sequence[float]) -> dict[str, object]:
     part = scenario.model_dump(
         mode="json", include={"track", "line", "channel", "solution", "irregularity"}
     )
@@ -452,4 +496,5 @@ def _cache_key(scenario: Scenario) -> dict[str, object]:
         "channel": part["channel"],
         "solution": {key: part["solution"][key] for key in ("frequency_limit", "sines")},
         "format": FORMAT,
+        "part": list(segment),
     }
