@@ -26,10 +26,11 @@ from .local import (
     low_pass,
     with_tones,
 )
-from .modal import ModalRun, modal_run
+from .modal import ModalRun
 from .motion import TrainMotion
 from .newmark import NewmarkRun
 from .scenario import Polygon, Scenario, Train
+from .segments import line_run
 from .traffic import Running, Traffic
 from .waves import Real, pinned_pinned_frequency, rail_frequency
 
@@ -314,9 +315,7 @@ class HybridRun:
         if newmark:
             self._run = NewmarkRun(assemble(self._coarse_scenario), self._traffic, derivatives)
         else:
-            self._run = modal_run(
-                self._coarse_scenario, self._traffic, derivatives, balance=balance
-            )
+            self._run = line_run(self._coarse_scenario, self._traffic, derivatives, balance=balance)
         self.field = LocalField(scenario, self.crossover, derivatives)
         self._filters = interpolation_filters(self.ratio)
         self._channels = len(scenario.channel)

@@ -867,6 +867,11 @@ class ModalRun:
     ratio = 1
 
     @property
+    def _outputs(self) -> int:
+        """Columns that the kernel fills."""
+        return len(self._derivatives) * len(self.line.channel_x)
+
+    @property
     def states(self) -> int:
         """Number of modes of the line that are stepped."""
         return len(self.line.eigenvalues)
@@ -914,18 +919,23 @@ class ModalRun:
             np.concatenate(parts) for parts in zip(held, ahead, strict=True)
         )
         self._held = [part[-4:].copy() for part in (time, position, force, outputs, answer)]
+        now = slice(2, -2)
+        return time[now], position[now], force[now], self._signals(outputs, answer)
+
+    def _signals(self, outputs: Array, answer: Array) -> Array:
+        """Channel outputs (n, O) of samples with two more on either side."""
         signals = outputs[2:-2]
         width = answer.shape[1]
         for number, derivative in enumerate(self._derivatives):
             _add_dropped(answer, derivative, self.traffic.step, signals, number * width)
-        return time[2:-2], position[2:-2], force[2:-2], signals
+        return signals
 
     def _march_on(self, samples: int) -> list[Array]:
         """Time, position, force, outputs of the kept modes, sums h, g0, g1 of :meth:`advance`."""
         time: Array = (self._next + np.arange(samples, dtype=np.float64)) * self.traffic.step
         position = self.traffic.position(time)
         force = np.full(position.shape, np.nan)
-        outputs = np.empty((samples, len(self._derivatives) * len(self.line.channel_x)))
+        outputs = np.empty((samples, self._outputs))
         answer = np.zeros((samples, len(self.line.channel_x), 3))
         done = 0
         while done < samples:

@@ -77,6 +77,8 @@ class ModalLine:
         solved: number of complex modes that were computed, K of them kept.
         joint_shapes: (J, K); deflections and rotations of the layers at the cuts that bound a
             segment, left cut first; (0, K) for a whole line.
+        channel_inertia: (C, K); the part of ``channel_shapes`` that is due to accelerations,
+            without its factor lambda^2.
     """
 
     eigenvalues: Complex
@@ -92,6 +94,7 @@ class ModalLine:
     length: float
     solved: int
     joint_shapes: Complex
+    channel_inertia: Complex
 
     def rail(self, x: Array | float, derivative: int = 0) -> Complex:
         """Shapes of the rail (or their slope) at ``x`` (m), zero off the line: (len(x), K)."""
@@ -314,17 +317,19 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
     table.real = (flat @ np.ascontiguousarray(vectors.real)).reshape(table.shape)
     table.imag = (flat @ np.ascontiguousarray(vectors.imag)).reshape(table.shape)
     channels = np.empty((len(scenario.channel), len(values)), complex)
+    inertia = np.empty_like(channels)
     for number, channel in enumerate(scenario.channel):
         probe = structure.probe(channel)
+        inertia[number] = ((probe.acceleration_rows @ real) @ vectors)[0]
         channels[number] = (
             (probe.displacement_rows @ real) @ vectors
             + (probe.velocity_rows @ real) @ vectors * values
-            + (probe.acceleration_rows @ real) @ vectors * values**2
-        )[0]
+        )[0] + inertia[number] * values**2
     kept = np.ones(solved, bool)
     if not structure.cuts:
         kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
     values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
+    inertia = inertia[:, kept]
     table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
     inverse = _flexibility(structure)
     static_weights = weights / -values
@@ -361,6 +366,7 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
         length=structure.length,
         solved=solved,
         joint_shapes=joints @ real @ vectors,
+        channel_inertia=inertia,
     )
     return built, LineForms(omega, damping, vectors, limit)
 

@@ -40,15 +40,24 @@ from numpy.typing import NDArray
 from .beam import Array
 from .contact import force_of, solve_contact
 from .line import Structure, assemble, rail_cut
-from .modal import KERNEL, LANES, SLOW, Fleet, ModalRun, _step_unit, exponential_weights
+from .modal import (
+    KERNEL,
+    LANES,
+    SLOW,
+    Fleet,
+    ModalRun,
+    _step_unit,
+    exponential_weights,
+    modal_run,
+)
 from .modes import Complex, ModalLine, build_modal_line, cached_line
 from .scenario import Scenario
 from .traffic import Traffic
 
 SEGMENT_LENGTH = 24.0
-"""Length (m) at which segments aim."""
+"""Length (m) at which segments aim at 5 kHz; the modes of a line number length * sqrt(limit)."""
 WHOLE_LENGTH = 80.0
-"""Length (m) up to which a line is solved whole."""
+"""Length (m) at 5 kHz up to which a line is solved whole: 72 m cost as much either way."""
 CUT_CLEARANCE = 2.0
 """Distance (m) that cuts keep, where they can, from bearings and channels."""
 JOINT = 6
@@ -63,10 +72,10 @@ def find_cuts(scenario: Scenario) -> tuple[float, ...]:
     Spans are taken together up to about ``SEGMENT_LENGTH``, and never cut: a piece of a span would
     not be held. Short approaches stay with the span beside them.
     """
-    line = scenario.line
-    if line.length <= WHOLE_LENGTH or scenario.solution.sines is not None:
+    stretch = math.sqrt(5000 / scenario.solution.frequency_limit)
+    if scenario.line.length <= WHOLE_LENGTH * stretch or scenario.solution.sines is not None:
         return ()
-    return cut_into(scenario, SEGMENT_LENGTH)
+    return cut_into(scenario, SEGMENT_LENGTH * stretch)
 
 
 def cut_into(scenario: Scenario, length: float) -> tuple[float, ...]:
@@ -196,10 +205,10 @@ class SegmentTables:
         reaction: (cells, 4, 4, 12) cubics of: displacement at a wheelset per lambda_0 and lambda_1,
             displacement at the severed coordinates per force, at the end of a step and in its mean.
         inner, lower, upper: (S - 1, 12, 12) factors of the matrix of the cuts.
-        channel_segment: (O,); channel_first: (O,) first value in ``channel_weights``.
+        channel_segment: (O,) of the displacements of the C channels and then of what each owes to
+            accelerations; channel_first: (O,) first value in ``channel_weights``.
         channel_weights: of each output, (2 K,).
         channel_feed: (cells, 2, 4, O) as in :class:`ModalTables`.
-        channel_joint: (O, 2, 6) output per left and right lambda at the end of the step.
         grid_start: (S,). grid_step, length: m.
     """
 
@@ -220,7 +229,6 @@ class SegmentTables:
     channel_first: NDArray[np.int64]
     channel_weights: Array
     channel_feed: Array
-    channel_joint: Array
     grid_start: Array
     grid_step: float
     length: float
@@ -237,12 +245,11 @@ def _packed(values: Complex, size: int) -> Array:
 def segment_tables(
     line: SegmentedLine,
     step: float,
-    derivatives: tuple[int, ...],
     *,
     order: int = 2,
     precision: type[np.floating] = np.float32,
 ) -> SegmentTables:
-    """Tables for a time step (s); channel outputs are ordered derivative by derivative."""
+    """Tables for a time step (s)."""
     parts = line.parts
     count = len(parts)
     sizes = np.zeros((count, 2), np.int64)
@@ -251,11 +258,10 @@ def segment_tables(
     cells = [len(part.rail_shapes) for part in parts]
     blocks = np.zeros((3, max(count - 1, 0), BLOCK, BLOCK))
     shapes, joints, vectors, compliance, reaction = [], [], [], [], []
-    outputs = len(derivatives) * len(line.channel_x)
+    outputs = 2 * len(line.channel_x)
     segment = np.zeros(outputs, np.int64)
-    weights: list[Array] = [np.zeros(0)] * outputs
+    weights: list[Array] = [np.zeros(2 * padded[0])] * outputs
     feeds: list[Array] = []
-    channel_joint = np.zeros((outputs, 2, BLOCK // 2))
     thirds = np.vander(np.arange(4) / 3, increasing=True)
     for s, (part, size) in enumerate(zip(parts, padded, strict=True)):
         lam, root = part.eigenvalues, np.sqrt(part.weights)
@@ -302,22 +308,13 @@ def segment_tables(
                     block = gram[i, j][first, second]
                     target = blocks[kind, at, i * half :, j * half :]
                     target[: block.shape[0], : block.shape[1]] += block
-        channel: Complex = part.channel_shapes * root
-        feed = np.zeros((len(rail), 2, 4, outputs))
-        for number, derivative in enumerate(derivatives):
-            observe = channel * lam**derivative
-            direct = channel * lam if derivative == 2 else 0 * channel
-            columns = slice(number * len(channel), (number + 1) * len(channel))
-            feed[:, 0, :, columns] = (rail @ (observe * now + direct).T).real
-            feed[:, 1, :, columns] = (rail @ (observe * recall).T).real
-            if derivative == 2:
-                push = (direct @ joint.T).real
-                channel_joint[columns, 0, :left] += push[:, :left]
-                channel_joint[columns, 1, : side - left] += push[:, left:]
-            for c in np.flatnonzero(abs(channel).max(axis=1, initial=0.0) > 0):
-                segment[number * len(channel) + c] = s
-                weights[number * len(channel) + c] = _packed(observe[c], size)
-        feeds.append(feed)
+        motion = part.channel_shapes - part.channel_inertia * lam**2
+        channel: Complex = np.concatenate([motion, part.channel_inertia]) * root
+        feeds.append(
+            np.stack([(rail @ (channel * factor).T).real for factor in (now, recall)], axis=1)
+        )
+        for c in np.flatnonzero(abs(channel).max(axis=1, initial=0.0) > 0):
+            segment[c], weights[c] = s, _packed(channel[c], size)
     inner, lower, upper = _factor(blocks)
     tables = SegmentTables(
         first=np.cumsum([0, *(2 * size for size in padded)]),
@@ -337,7 +334,6 @@ def segment_tables(
         channel_first=np.cumsum([0, *(len(row) for row in weights)])[:-1],
         channel_weights=np.concatenate([np.zeros(0), *weights]),
         channel_feed=np.concatenate(feeds),
-        channel_joint=channel_joint,
         grid_start=np.array([part.grid_start for part in parts]),
         grid_step=parts[0].grid_step,
         length=line.length,
@@ -523,7 +519,6 @@ def _march(  # type: ignore[no-untyped-def]
     channel_first,
     channel_weights,
     channel_feed,
-    channel_joint,
     grid_start,
     grid_step,
     length,
@@ -757,12 +752,6 @@ def _march(  # type: ignore[no-untyped-def]
             s, k = channel_segment[o], channel_first[o]
             a, b = first[s], first[s + 1]
             outputs[n, o] += _dot(channel_weights[k : k + b - a], modal[a:b])
-            for side in range(2):
-                c = s - 1 + side
-                for row in range(sizes[s, side]):
-                    outputs[n, o] += channel_joint[o, side, row] * (
-                        cut[c, row] + cut[c, half + row]
-                    )
         for s in range(parts):
             a, b = first[s], first[s + 1]
             w, h = b - a, (first[s + 1] - first[s]) // 2
@@ -862,10 +851,41 @@ class SegmentRun(ModalRun):
 
     def _prepare(self, derivatives: tuple[int, ...], order: int) -> None:
         self.tables = segment_tables(
-            self.line, self.traffic.step, derivatives, order=order, precision=self._precision
+            self.line, self.traffic.step, order=order, precision=self._precision
         )
         width = int(self.tables.first[-1])
         self._modal, self._load = np.zeros(width), np.zeros(width)
+
+    @property
+    def _outputs(self) -> int:
+        return 2 * len(self.line.channel_x)
+
+    def _signals(self, outputs: Array, answer: Array) -> Array:
+        """Channel outputs of samples with two more on either side, by differences of fourth order.
+
+        The cut forces between samples are good in their mean only, and q' = lambda q + p needs
+        them at the samples; displacements are as good as the method.
+        """
+        step, now = self.traffic.step, slice(2, -2)
+
+        def rate(values: Array, order: int) -> Array:
+            a, b, c, d, e = (values[i : len(values) - 4 + i] for i in range(5))
+            return (
+                c,
+                (a - 8 * b + 8 * d - e) / (12 * step),
+                (16 * (b + d) - a - e - 30 * c) / (12 * step**2),
+                (2 * b - a - 2 * d + e) / (2 * step**3),
+                (a - 4 * b + 6 * c - 4 * d + e) / step**4,
+            )[order]
+
+        motion, inertia = np.split(outputs, 2, axis=1)
+        signals = [
+            rate(motion + answer[:, :, 1], order)
+            + rate(answer[:, :, 2], order + 1)
+            + rate(inertia, order + 2)
+            for order in self._derivatives
+        ]
+        return np.concatenate([np.zeros((len(outputs[now]), 0)), *signals], axis=1)
 
     def _static_shapes(self, place: Array) -> list[tuple[NDArray[np.intp], Complex]]:
         """Of each segment: which places (m) lie on it, and the rail's shapes there."""
@@ -921,7 +941,7 @@ class SegmentRun(ModalRun):
             self._put(self._modal, s, y.conj())
             self._put(self._mean, s, ((-1 / lam - mn) * load + (-1 / lam - k0) * joint).conj())
 
-    def _put(self, vector: Array, segment: int, values: Complex) -> None:
+    def _put(self, vector: NDArray[np.floating], segment: int, values: Complex) -> None:
         a, b = self.tables.first[segment : segment + 2]
         half = (b - a) // 2
         vector[a : a + len(values)] += values.real
@@ -968,7 +988,6 @@ class SegmentRun(ModalRun):
                 tables.channel_first,
                 tables.channel_weights,
                 tables.channel_feed,
-                tables.channel_joint,
                 tables.grid_start,
                 tables.grid_step,
                 tables.length,
@@ -1002,7 +1021,7 @@ class SegmentRun(ModalRun):
             self._before = before
             lost, worst = lost + int(more), max(worst, float(residual))
             for axle in np.flatnonzero(number[stop - 1] != segment):
-                self._hand_over(fleet, axle, int(segment[axle]), int(number[stop - 1, axle]))
+                self._hand_over(fleet, int(axle), int(segment[axle]), int(number[stop - 1, axle]))
             segment = number[stop - 1].copy()
             begin = stop
         return lost, worst
@@ -1045,3 +1064,13 @@ class _StaticJoint:
         """Cut forces (without sign) per motion (J, ...) of the severed coordinates."""
         scale = self._scale if motion.ndim == 2 else self._scale[:, 0]
         return np.asarray(scale * self._factor.solve(np.ascontiguousarray(scale * motion)))
+
+
+def line_run(
+    scenario: Scenario, traffic: Traffic, derivatives: tuple[int, ...], *, balance: bool
+) -> ModalRun:
+    """Run of a scenario's line: whole if it is short, else in segments, without energy balance."""
+    cuts = find_cuts(scenario)
+    if not cuts:
+        return modal_run(scenario, traffic, derivatives, balance=balance)
+    return SegmentRun(segmented_line(scenario, cuts), traffic, derivatives)

@@ -14,11 +14,12 @@ from .contact import compression_of, wheelset_law
 from .errors import InputError
 from .hybrid import HybridRun
 from .line import assemble
-from .modal import ModalRun, modal_run
+from .modal import ModalRun
 from .motion import TrainMotion
 from .newmark import NewmarkRun
 from .quality import QualityReport
 from .scenario import Scenario, Train
+from .segments import line_run
 from .traffic import Traffic
 from .vehicle import build_units
 
@@ -117,7 +118,7 @@ class Simulation:
         elif scenario.solution.integrator == "newmark":
             self._run = NewmarkRun(assemble(scenario), self._traffic, derivatives)
         else:
-            self._run = modal_run(scenario, self._traffic, derivatives, balance=balance)
+            self._run = line_run(scenario, self._traffic, derivatives, balance=balance)
         tell(f"{self.states} modes; compiling or loading the stepping kernel")
 
     @property

@@ -51,4 +51,6 @@ def beam_line(channels, modes=MODES, cells=640):
         channel_band=np.full(len(x), omega[-1] / (2 * np.pi)),
         length=LENGTH,
         solved=modes,
+        joint_shapes=np.zeros((0, modes), complex),
+        channel_inertia=np.zeros((len(x), modes), complex),
     )
