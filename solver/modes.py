@@ -236,7 +236,8 @@ def reduced_modes(structure: Structure, limit: float) -> tuple[Array, Array]:
     """
     if structure.size > SIZE_LIMIT:
         raise SolverError(
-            f"line of {structure.length:g} m to {structure.scenario.solution.frequency_limit:g} Hz "
+            f"{structure.bounds[1] - structure.bounds[0]:g} m of line to "
+            f"{structure.scenario.solution.frequency_limit:g} Hz "
             f"has {structure.size} coordinates; limit of the modal solution {SIZE_LIMIT}: shorten "
             "the line or lower solution.frequency_limit"
         )

@@ -159,6 +159,8 @@ def bare_span(channels: Array, sines: int = 20, kept: int = 15, cells: int = 640
         channel_band=np.full(len(channels), omega[-1] / (2 * np.pi)),
         length=SPAN_LENGTH,
         solved=kept,
+        joint_shapes=np.zeros((0, kept), complex),
+        channel_inertia=np.zeros((len(channels), kept), complex),
     )
 
 

@@ -314,7 +314,7 @@ def test_a_train_longer_than_a_segment_over_three_spans(monkeypatch):
         train=[{"preset": "CRH3", "speed": 80.0, "start": -30.0}],
         contact={"law": "hertz"},
         irregularity={},
-        solution={"frequency_limit": 400.0, "end_time": 1.5},
+        solution={"frequency_limit": 400.0, "end_time": 0.9},
     )
     sim = Simulation(scenario, outputs=("displacement",))
     assert isinstance(sim._run, SegmentRun)
