@@ -178,7 +178,13 @@ def _train(
     # the wheelsets of a known type are
     trust = _GEOMETRY**2 / (_GEOMETRY**2 + fit.scale**2) if passage.known else 1.0
     predicted = motion.time_at(places)
-    axle_times = np.where(fit.used[0], predicted + trust * (fit.time[0] - predicted), predicted)
+    if passage.known:
+        late = -fit.residual[0] / np.maximum(motion.speed_at(predicted), 0.5)
+        # the channel's own place is in the motion already
+        late -= np.median(late[fit.used[0]]) if fit.used[0].any() else 0.0
+    else:
+        late = fit.time[0] - predicted
+    axle_times = predicted + np.where(fit.used[0], trust * late, 0.0)
     scatter = float(np.sqrt(trust) * fit.scale)
     events: list[TrainEvent] = []
     reference = passage.traces[0]
