@@ -26,6 +26,7 @@ _CELL = 0.2  # m, averaging of the energy
 _ROUNDS = 5
 _FREE_POSITION = 0.3  # m, of a channel while only spacings are compared
 _MIRROR = 1.6  # m either side of an axis of symmetry that are compared
+_MIRROR_SIGMAS = 8.0  # largest minus least of some thirty noisy cells is 4 to 5 sigma
 _MIRROR_RISE = 0.7  # ln, 3 dB: flatter levels have no axis
 _COVERED = 0.6  # part of a wheelset's window that must have been measured
 
@@ -140,10 +141,13 @@ def _centre(
     energy, covered = _windows(trace, centre, speed, _MIRROR + reach)
     energy = np.log(np.maximum(energy, 0.3 * trace.noise))
     pulses: dict[int, Array] = {}
+    noise: dict[int, float] = {}
     for c in range(4):
         members = (classes == c) & (covered > _COVERED)
         if members.sum() >= 2:
             pulses[c] = np.mean(energy[members], axis=0)
+            scatter = float(np.mean(np.std(energy[members], axis=0)))
+            noise[c] = scatter / float(np.sqrt(members.sum()))
     twin = {0: 0, 1: 2, 2: 1, 3: 3}
     pairs = [(c, float((classes == c).sum())) for c in pulses if twin[c] in pulses]
     if not pairs:
@@ -152,7 +156,8 @@ def _centre(
     cost = np.zeros(2 * steps + 1)
     rise = 0.0
     for c, weight in pairs:
-        rise = max(rise, float(np.ptp(pulses[c][middle - width : middle + width + 1])))
+        height = float(np.ptp(pulses[c][middle - width : middle + width + 1]))
+        rise = max(rise, height if height > _MIRROR_SIGMAS * noise[c] else 0.0)
         for k in range(-steps, steps + 1):
             part = slice(middle + k - width, middle + k + width + 1)
             x, y = pulses[c][part], pulses[twin[c]][part][::-1]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from .kinematics import POSITION_SIGMA, Motion, robust_scale
+from .kinematics import HIGH_BAND_POSITION_SIGMA, Motion, robust_scale
 from .pattern import Trace
 
 Array = NDArray[np.float64]
@@ -203,7 +203,10 @@ def _two_channels(
         speed=(
             speed,
             float(
-                np.hypot(motion.speed_sigma(float(mid)), speed * 2**0.5 * POSITION_SIGMA / distance)
+                np.hypot(
+                    motion.speed_sigma(float(mid)),
+                    speed * 2**0.5 * HIGH_BAND_POSITION_SIGMA / distance,
+                )
             ),
         ),
         times=first,

@@ -29,6 +29,11 @@ _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
 _RISE = 10.0  # a train on rails that still ring
 _FADED = 1 / 100  # of the strongest level of an event: what is left is no train
+_STRONG = 1 / 4  # of the strongest level: a wheelset is near
+_CREEP = 1.023  # by which the least level is forgotten a frame, 10 dB/s
+_RISEN = 1.6  # over the least level: another wheelset comes, 2 dB
+_HANG_LEAST_S, _HANG_FACTOR, _HANG_MORE_S = 1.0, 2.0, 0.5
+_HANG_LEARNT_NS = 1_000_000_000
 _UPDATE_NS = 200_000_000
 _UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
@@ -41,8 +46,8 @@ class DetectorConfig:
     Attributes:
         min_speed: lowest speed looked for (m/s).
         max_speed: highest speed looked for (m/s).
-        hang: quiet time that ends an event (s); longer than the time between two bogies of a car
-            at ``min_speed``.
+        hang: quiet time that ends an event at the latest (s); longer than the time between two
+            bogies of a car at ``min_speed``. A train whose bogies follow faster ends sooner.
         max_event: an event longer than this is a changed noise level, not a train (s).
         max_lag: a group this far behind the others is taken for silent (s).
     """
@@ -83,6 +88,8 @@ class _Event:
     triggered: set[int]
     last_ns: dict[int, int]
     strongest: dict[int, float]
+    least: dict[int, float]
+    pause_ns: dict[int, int]
     truncated: bool = False
     next_update_ns: int = 0
     updates: int = 0
@@ -248,17 +255,14 @@ class TrainDetector:
             if self._event is None and self._fresh(channel, level, now_ns):
                 delay = group.stream.shift[group.trigger.band[local]]
                 start = now_ns - round((FRAME * group.stream.step + delay) * 1e9)
-                self._event = _Event(start, set(), {}, {})
+                self._event = _Event(start, set(), {}, {}, {}, {})
                 self._event.next_update_ns = now_ns + _UPDATE_NS
                 ratio = float(group.trigger.ratio[local])
                 events.append(report.arrival(self.channels[channel], start, ratio))
             self._active_ns[channel] = now_ns
             if self._event is not None:
-                strongest = max(level, self._event.strongest.get(channel, 0.0))
-                self._event.strongest[channel] = strongest
                 self._event.triggered.add(channel)
-                if level > _FADED * strongest:
-                    self._event.last_ns[channel] = now_ns
+                self._follow(self._event, channel, level, now_ns)
         if self._event is None:
             self._lowest[group.index] = np.minimum(
                 self._lowest[group.index], np.maximum(group.trigger.level, 1.0)
@@ -266,7 +270,7 @@ class TrainDetector:
         if self._event is None:
             return events
         last = self._deciding_last(self._event)
-        if now_ns - last > self.config.hang * 1e9:
+        if now_ns - last > self._hang_ns(self._event, now_ns):
             events += self._close(now_ns)
         elif now_ns - self._event.start_ns > self.config.max_event * 1e9:
             events += self._close(now_ns)
@@ -276,6 +280,30 @@ class TrainDetector:
         elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
             events += self._update(self._event, now_ns)
         return events
+
+    def _follow(self, event: _Event, channel: int, level: float, now_ns: int) -> None:
+        """Note when a wheelset was last near: strong energy, or energy that rises again.
+
+        What only fades is a train that leaves: a rail carries it on, 1 dB/m weaker.
+        """
+        strongest = max(level, event.strongest.get(channel, 0.0))
+        least = min(level, _CREEP * event.least.get(channel, level))
+        event.strongest[channel], event.least[channel] = strongest, least
+        near = level > _STRONG * strongest or level > max(_FADED * strongest, _RISEN * least)
+        if near or _FADED * strongest < 1:
+            if channel in event.last_ns:
+                pause = now_ns - event.last_ns[channel]
+                event.pause_ns[channel] = max(pause, event.pause_ns.get(channel, 0))
+            event.last_ns[channel] = now_ns
+
+    def _hang_ns(self, event: _Event, now_ns: int) -> int:
+        """Quiet time that ends an event: a multiple of the longest pause that it had so far."""
+        pauses = [t for c, t in event.pause_ns.items() if self.channels[c].layer == "rail"]
+        last = self._deciding_last(event)
+        if not pauses or last - event.start_ns < _HANG_LEARNT_NS:
+            return round(self.config.hang * 1e9)
+        hang = _HANG_FACTOR * max(pauses) * 1e-9 + _HANG_MORE_S
+        return round(1e9 * min(max(hang, _HANG_LEAST_S), self.config.hang))
 
     def _fresh(self, channel: int, level: float, now_ns: int) -> bool:
         """Whether the activity of a channel is new, not what an earlier train left ringing."""

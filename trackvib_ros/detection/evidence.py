@@ -44,6 +44,9 @@ _GAP_NEAR, _GAP_FAR = 0.2, 0.6  # m, spread of wheelbases and of the other gaps 
 _NEAR = 3.5  # m
 _CLOCK_S = 0.1
 _OUTLIER = 2.5
+_COARSE = 0.2  # m, scatter at which nothing finer than a wheelbase can be told
+_COARSE_COST = 7.0  # ln of odds: its tails are not Gaussian and imitate other gaps
+_LEAST_SHARE = 0.6  # of the scatter about the best type that must be noise
 _NULL_LOG = float(np.log(2.2))  # a wheelset found anywhere within its window of 2.2 m
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
@@ -118,8 +121,7 @@ def _model(candidate: Candidate, noise: float, effects: Sequence[Array]) -> tupl
     # what the first regression left, so that nothing large cancels
     rest = (candidate.places[None, :] + candidate.shifts[:, None])[seen]
     rest = rest - start.distance_at(fit.time[seen])
-    spread = max(fit.scale, noise)
-    excess = np.maximum(1.0, np.abs(fit.residual[seen]) / (_OUTLIER * spread))
+    excess = np.maximum(1.0, np.abs(fit.residual[seen]) / (_OUTLIER * noise))
     z = np.stack([effect[seen] for effect in effects], axis=1)
     factor = linalg.cho_factor(np.diag((noise * excess) ** 2) + z @ z.T, lower=True)
     x = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
@@ -152,7 +154,9 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     if not candidates:
         return []
     top = max(c.score for c in candidates)
-    noise = min(_noise(c) for c in candidates if c.score > top - 2 * _SCORE_NOISE)
+    likely = [c for c in candidates if c.score > top - 2 * _SCORE_NOISE]
+    # classes of few wheelsets understate it
+    noise = max(min(_noise(c) for c in likely), _LEAST_SHARE * min(c.fit.scale for c in likely))
     found: list[tuple[float, int, Kind, int, Motion]] = []
     for index, c in enumerate(candidates):
         channels, axles = c.fit.observed.shape
@@ -175,13 +179,14 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             _SCALE_VARIED * along,
             *((_GAP_NEAR if gap < _NEAR else _GAP_FAR) * n for gap, n in counts),
         ]
+        unlisted = float(np.log(PRIOR_UNKNOWN / 2)) - _COARSE_COST * min(1.0, noise / _COARSE)
         prior = float(-np.log(len(candidates))) - _SCORE_WEIGHT * max(
             0.0, top - c.score - _SCORE_NOISE
         )
         trials: list[tuple[Kind, int, float, list[Array]]] = [
             ("type", -1, float(np.log(1 - PRIOR_UNKNOWN)), []),
-            ("scaled", -1, float(np.log(PRIOR_UNKNOWN / 2)), scaled),
-            ("varied", -1, float(np.log(PRIOR_UNKNOWN / 2)), varied),
+            ("scaled", -1, unlisted, scaled),
+            ("varied", -1, unlisted, varied),
         ]
         for k in range(1, channels):
             effect = np.zeros((channels, axles))

@@ -27,8 +27,9 @@ its pulses below 150 Hz: the roughness near a sensor and its place in the bay ar
 wheelset. Measured on 34 channels of computed passages at 45 to 380 km/h (rms 0.098 m, three in four
 within 0.06 m)."""
 
-HIGH_BAND_POSITION_SIGMA = 0.3
-"""The same from higher bands only, when noise hides the lowest (rms 0.20 to 0.27 m, tails)."""
+HIGH_BAND_POSITION_SIGMA = 0.5
+"""The same from higher bands only, when noise hides the lowest (rms 0.20 to 0.27 m, tails to
+1.3 m)."""
 
 
 @dataclass(frozen=True)

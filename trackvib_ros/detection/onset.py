@@ -1,6 +1,6 @@
 """Causal energy trigger per channel: short-term energy against a noise floor that is learned.
 
-The short-term average over 1, 4 and 16 frames is compared with the floor in every band. The
+The short-term average over 1 to 16 frames is compared with the floor in every band. The
 thresholds follow from the chi-square law of the energy of band-limited Gaussian noise: 2 B T
 degrees of freedom in a band of width B over time T (Urkowitz, Proc. IEEE 55, 1967, 523). The floor
 is frozen while an event lasts.
@@ -14,12 +14,12 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
-WINDOWS = (1, 4, 16)
+WINDOWS = (1, 2, 4, 8, 16)
 """Lengths of the short-term averages (frames)."""
 
-_FALSE_ALARM = 1e-10  # per test, Gaussian noise
-_MARGIN = 1.3  # the floor itself is an estimate
-_LEAST_RATIO = 2.0
+_FALSE_ALARM = 1e-9  # per test, Gaussian noise: 0.007 an hour and channel before the margin
+_MARGIN = 1.2  # the floor itself is an estimate
+_LEAST_RATIO = 1.6
 _WARM_UP = 50  # frames
 _FLOOR_FRAMES = 800.0  # time constant of the floor
 _FALL_FRAMES = 50.0  # faster downwards: a floor learned inside a train is wrong

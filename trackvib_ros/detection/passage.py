@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 CONFIRM_SCORE = 0.60
 """Least pattern correlation of a confirmed train."""
 
-KNOWN_SCORE = 0.70
+KNOWN_SCORE = 0.62
 """Least pattern correlation at which a catalogue type is named."""
 
 CONFIRM_CORRELATION = 0.6
@@ -32,7 +32,9 @@ HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
 
 _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
-_STRETCH = 1.4  # a delay that fits no type better than this is a clock's fault, not an unknown type
+_STRETCH = (
+    1.25  # a delay that fits no type better than this is a clock's fault, not an unknown type
+)
 
 
 @dataclass(frozen=True)
