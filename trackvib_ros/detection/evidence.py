@@ -179,14 +179,15 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             _SCALE_VARIED * along,
             *((_GAP_NEAR if gap < _NEAR else _GAP_FAR) * n for gap, n in counts),
         ]
-        unlisted = float(np.log(PRIOR_UNKNOWN / 2)) - _COARSE_COST * min(1.0, noise / _COARSE)
+        unlisted = float(np.log(PRIOR_UNKNOWN / 2))
+        coarse = unlisted - _COARSE_COST * min(1.0, noise / _COARSE)
         prior = float(-np.log(len(candidates))) - _SCORE_WEIGHT * max(
             0.0, top - c.score - _SCORE_NOISE
         )
         trials: list[tuple[Kind, int, float, list[Array]]] = [
             ("type", -1, float(np.log(1 - PRIOR_UNKNOWN)), []),
-            ("scaled", -1, unlisted, scaled),
-            ("varied", -1, unlisted, varied),
+            ("scaled", -1, coarse if channels > 1 else unlisted, scaled),
+            ("varied", -1, coarse, varied),
         ]
         for k in range(1, channels):
             effect = np.zeros((channels, axles))
