@@ -40,6 +40,8 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 LANES = 32
+"""Modes are padded to a multiple of this, so that vectors of any width leave no rest."""
+
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 """Freedoms given to the compiler; not-a-number and infinity keep their meaning."""
 
@@ -354,7 +356,7 @@ def march(
 
 
 CHUNK = 8
-"""Samples of the modes that are kept until the channels are read, so that they stay cached."""
+"""Samples of the modes that are kept until the channels are read, four at a time."""
 
 KERNEL = {"cache": True, "fastmath": FASTMATH, "error_model": "numpy"}
 
