@@ -1,6 +1,7 @@
 """Vehicle-track-bridge dynamics: hierarchical-beam FE extended to 5 kHz by SEA. No ROS here."""
 
 from .check import check_run
+from .classes import ClassRun, run_classes
 from .errors import InputError, SolverError
 from .motion import TrainMotion
 from .proofs import Proof, ensemble_proofs, hybrid_proofs, line_proofs
@@ -26,6 +27,7 @@ from .waves import pinned_pinned_frequency, rail_frequency
 __all__ = [
     "GRAVITY",
     "Block",
+    "ClassRun",
     "InputError",
     "Proof",
     "QualityReport",
@@ -48,6 +50,7 @@ __all__ = [
     "preset_names",
     "preset_text",
     "rail_frequency",
+    "run_classes",
     "scenario_schema",
     "train_preset",
     "wavelength_classes",
