@@ -106,6 +106,7 @@ class Simulation:
         self._outputs: tuple[Output, ...] = tuple(name for name in OUTPUTS if name in outputs)
         self._traffic = Traffic(scenario)
         self._forgets = columns == "present"
+        self._steady = (0, 0)
         self._index = 0
         _check_step(scenario)
         for train in scenario.train:
@@ -186,9 +187,14 @@ class Simulation:
     def _rearrange(self, samples: int) -> None:
         """Columns for the trains near the line in the next samples; the departed are forgotten."""
         ahead = math.ceil(LOOK_AHEAD / (self.step_ns * 1e-9))
-        present = self._traffic.present(self._index, self._index + samples + ahead)
+        first, last = self._index, self._index + samples + ahead
+        end, start = self._steady
+        if first < end and last < start:
+            return
+        present = self._traffic.present(first, last)
         if present != self._traffic.arranged:
-            self._run.arrange(present, self._traffic.departed(self._index))
+            self._run.arrange(present, self._traffic.departed(first))
+        self._steady = self._traffic.steady(first, last)
 
     def blocks(self, samples: int = 800) -> Iterator[Block]:
         """Blocks of ``samples`` samples to ``end_index``; the last one may be shorter."""
@@ -221,6 +227,7 @@ class Simulation:
             self._run.check(train)
         index = self._traffic.add(train, self._run.next_sample)
         self._run.arrange((*self._traffic.arranged, index))
+        self._steady = (0, 0)
         return index
 
 

@@ -184,6 +184,12 @@ class Traffic:
         """(n, W) values by column as they are after :meth:`arrange`; NaN in new columns."""
         return np.where(source >= 0, np.pad(values, ((0, 0), (0, 1)))[:, source], np.nan)
 
+    def steady(self, first: int, last: int) -> tuple[int, int]:
+        """First later end, and first later start, of a unit that :meth:`present` looks at."""
+        ends = [unit.end for unit in self.running if unit.end > first and unit.start <= last]
+        starts = [unit.start for unit in self.running if unit.start > last]
+        return min(ends, default=NEVER), min(starts, default=NEVER)
+
     def departed(self, sample: int) -> tuple[int, ...]:
         """Indices of the trains that are off the line from a sample on, for good."""
         coming = {unit.train for unit in self.running if unit.end > sample}
