@@ -30,8 +30,8 @@ Kind: TypeAlias = Literal["type", "scaled", "varied", "clock"]
 PRIOR_UNKNOWN = 0.05
 """Prior probability that a train is not in the catalogue."""
 
-PRIOR_CLOCK = 0.01
-"""Prior probability that a channel's clock is off."""
+PRIOR_CLOCK = 1e-4
+"""Prior probability that a channel's clock is off: rarer than an unlisted train by far."""
 
 _CLASS_SIGMA = (
     0.013  # m, wheelsets with other neighbours have other pulses; rms on computed passages
@@ -127,13 +127,8 @@ def _model(candidate: Candidate, noise: float, effects: Sequence[Array]) -> tupl
     x = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
     solved = linalg.cho_solve(factor, np.column_stack([x, rest]))
     prior = PRIOR_ACCELERATION**-2
-    # the times are observed, not the places: density ds/dt = v per wheelset, without which a train
-    # of free size would shrink to nothing
-    slope = np.stack([np.zeros_like(t), np.ones_like(t), t], axis=1)
-    slope /= start.speed_at(fit.time[seen])[:, None]
-    normal = x.T @ solved[:, :3] + np.diag([1e-9, 1e-9, prior]) + slope.T @ slope
+    normal = x.T @ solved[:, :3] + np.diag([1e-9, 1e-9, prior])
     right = x.T @ solved[:, 3] - np.array([0.0, 0.0, prior * start.acceleration])
-    right += slope.sum(axis=0)
     change = np.linalg.solve(normal, right)
     misfit = float(rest @ solved[:, 3] + prior * start.acceleration**2 - right @ change)
     log = -0.5 * misfit - float(np.sum(np.log(np.diag(factor[0]))))
@@ -168,12 +163,17 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             base.append(effect)
         for k in range(int(classes.max()) + 1):
             base.append(np.tile(_CLASS_SIGMA * (classes == k), (channels, 1)))
+        # the noise is in the times: effects that grow along the train must follow fitted places,
+        # or a train of free size shrinks to lessen its noise
+        noisy = np.where(c.fit.observed, c.fit.residual, 0.0)
+        square = float(c.places @ c.places)
         rounded = np.round(np.diff(c.places), 1)
         counts = []
         for gap in np.unique(rounded):
             before = np.concatenate([[0.0], np.cumsum(rounded == gap)])
-            counts.append((float(gap), np.tile(before, (channels, 1))))
-        along = np.tile(c.places, (channels, 1))
+            share = float(before @ c.places) / square
+            counts.append((float(gap), before[None, :] - share * noisy))
+        along = c.places[None, :] - noisy
         scaled = [_SCALE * along, *(_SHAPE * n for _, n in counts)]
         varied = [
             _SCALE_VARIED * along,

@@ -1,0 +1,89 @@
+"""Explanations of wheelset times whose truth is drawn from the model itself."""
+
+import numpy as np
+import pytest
+
+from trackvib_ros.detection import Catalogue
+from trackvib_ros.detection.axles import AxleFit
+from trackvib_ros.detection.evidence import Candidate, explain, half_interval
+from trackvib_ros.detection.kinematics import regress
+
+CATALOGUE = Catalogue.default()
+SPEED, BASELINE, NOISE = 60.0, 20.0, 0.02
+
+
+def candidate(nominal, true, offsets=(0.0, 0.0), channels=2, seed=0, noise=NOISE):
+    """A type of ``nominal`` places fitted to the times of a train of ``true`` ones."""
+    rng = np.random.default_rng(seed)
+    shifts = BASELINE * np.arange(channels)
+    time = (true[None, :] + shifts[:, None]) / SPEED + np.array(offsets)[:channels, None]
+    time = time + noise / SPEED * rng.standard_normal(time.shape)
+    seen = np.ones(time.shape, dtype=bool)
+    channel = np.nonzero(seen)[0]
+    # the second channel is aligned where its pattern was seen, as in a passage
+    scale = nominal[-1] / true[-1]
+    seen_shift = scale * SPEED * (time[:, 0] - time[0, 0])
+    place = (nominal[None, :] + seen_shift[:, None])[seen]
+    fit = regress(time[seen], place, channel, float(time.mean()))
+    zeros = np.zeros(time.shape)
+    residual = zeros.copy()
+    residual[seen] = fit.residual
+    sigma = np.full(channels, 0.1)
+    axle_fit = AxleFit(fit.motion, fit.scale, time, residual, zeros, seen, fit.offset, sigma)
+    return Candidate(nominal, shifts, axle_fit, 0.9)
+
+
+def test_a_listed_train_is_its_type():
+    axles = CATALOGUE["CRH3"].axles
+    best = explain([candidate(axles, axles)])[0]
+    assert best.kind == "type" and best.probability > 0.95
+    middle = 0.5 * axles[-1] / SPEED
+    # 64 wheelsets of 2 cm over 193 m: the regression's sigma, 4 of them
+    error = abs(float(best.motion.speed_at(middle)) - SPEED)
+    assert error < 4 * best.motion.speed_sigma(middle) < 1e-3 * SPEED
+
+
+@pytest.mark.parametrize("size", [0.92, 0.94, 1.06])
+def test_an_unlisted_size_is_told_by_the_delay_of_two_channels(size):
+    axles = CATALOGUE["CRH3"].axles
+    best = explain([candidate(axles, size * axles)])[0]
+    assert best.kind in ("scaled", "varied")
+    sigma = best.motion.speed_sigma(best.motion.epoch)
+    # places known to 0.1 m each over 20 m: 0.71 %
+    assert sigma / SPEED == pytest.approx(2**0.5 * 0.1 / BASELINE, rel=0.15)
+    assert abs(best.motion.speed - SPEED) < 3 * sigma
+
+
+def test_other_gaps_are_told_on_one_channel():
+    own, nearest = CATALOGUE["metro"].axles, CATALOGUE["metro_A6"].axles
+    best = explain([candidate(nearest, own, channels=1)])[0]
+    assert best.kind == "varied"
+    # the types differ by 17 % in size, which one channel cannot see: its sigma must say so
+    assert abs(best.motion.speed - SPEED) < 3 * best.motion.speed_sigma(best.motion.epoch)
+
+
+def test_a_train_of_free_size_does_not_shrink_with_noise():
+    axles = CATALOGUE["CRH3"].axles
+    shifts = []
+    for seed in range(20):
+        parts = explain([candidate(axles, axles, channels=1, seed=seed)])
+        (scaled,) = [e for e in parts if e.kind == "scaled"]
+        shifts.append(scaled.motion.speed / SPEED - 1)
+    # 4 % is the prior of the size; were the nominal places the regressor, the speed would come out
+    # 32 wheelsets x 0.04² = 5 % low
+    assert abs(np.mean(shifts)) < 0.2 * 0.04
+
+
+def test_a_wrong_clock_is_no_unlisted_train():
+    axles = CATALOGUE["CRH3"].axles
+    best = explain([candidate(axles, axles, offsets=(0.0, 0.1))])[0]
+    assert (best.kind, best.channel) == ("clock", 1)
+    assert best.motion.speed == pytest.approx(SPEED, rel=1e-3)
+
+
+def test_interval_of_a_mixture():
+    assert half_interval([(1.0, 5.0, 2.0)], 5.0) == pytest.approx(1.959964 * 2.0, rel=1e-6)
+    # a part of 4 % far away is outside, one of 20 % inside
+    near, far = (0.96, 0.0, 1e-6), (0.04, 1.0, 1e-6)
+    assert half_interval([near, far], 0.0) < 1e-4
+    assert half_interval([(0.8, 0.0, 1e-6), (0.2, 1.0, 1e-6)], 0.0) == pytest.approx(1.0, abs=1e-4)
