@@ -56,6 +56,9 @@ SPEED_RANGE = 2 ** (1 / 6)
 KEPT_TABLES = 32
 """Kinds of wheelsets whose local forces stay tabled, for further trains of that speed."""
 
+AHEAD = 0.1
+"""Time (s) that both sets are computed at once, so that short blocks cost no more than long ones."""
+
 HALF_TAPS = 4
 """Samples of the global set on either side that make a sample in between.
 
@@ -461,8 +464,8 @@ class HybridRun:
 
     @property
     def next_sample(self) -> int:
-        """First sample that the global set has not computed yet."""
-        return self._run.next_sample * self.ratio
+        """First sample that neither set has computed yet."""
+        return max(self._run.next_sample * self.ratio, self._local_first + len(self._local))
 
     def advance(self, samples: int) -> tuple[Real, Real, Real, Real]:
         """The next samples: time (n,), position (n, W), force (n, W), channel outputs (n, O).
@@ -499,6 +502,7 @@ class HybridRun:
         """Coarse samples first - HALF_TAPS + 1 ... last in the buffers."""
         need = last + 1 - self._coarse_done
         if need > 0:
+            need = max(need, math.ceil(AHEAD / self._traffic.step))
             _, _, force, signal = self._run.advance(need)
             if self._coarse_done == 0:
                 lead = HALF_TAPS - 1
@@ -517,7 +521,7 @@ class HybridRun:
         hop = self.field.hop
         have = self._local_first + len(self._local)
         if have < sample + count:
-            missing = -(-(sample + count - have) // hop)
+            missing = -(-max(sample + count - have, int(AHEAD / self.field.step)) // hop)
             middle = (have + (np.arange(missing) + 0.5) * hop) * self.field.step
             places = self._traffic.position(middle)
             on_line = (places >= 0) & (places <= self._traffic.length)
