@@ -57,7 +57,7 @@ KEPT_TABLES = 32
 """Kinds of wheelsets whose local forces stay tabled, for further trains of that speed."""
 
 AHEAD = 0.1
-"""Time (s) that both sets are computed at once, so that short blocks cost no more than long ones."""
+"""Time (s) computed at once by both sets, so that short blocks cost no more than long ones."""
 
 HALF_TAPS = 4
 """Samples of the global set on either side that make a sample in between.
