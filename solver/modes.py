@@ -25,7 +25,7 @@ from .scenario import Scenario
 
 Complex = NDArray[np.complex128]
 
-FORMAT = 13
+FORMAT = 14
 
 RESIDUAL_REACH = 8.0
 """Distance (m) from a channel beyond which dropped modes do not answer a wheel; faded out over
@@ -329,6 +329,10 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
     kept = np.ones(solved, bool)
     if not structure.cuts:
         kept = _participating(values, weights, abs(table[:, 0]).max(axis=0), abs(channels))
+    # a mode below the limit does not answer statically: dropped for its small share, it is left out
+    answered = kept | (abs(values) < 2 * np.pi * limit)
+    known, known_values = vectors[:, answered], values[answered]
+    known_channels = channels[:, answered]
     values, vectors, weights = values[kept], vectors[:, kept], weights[kept]
     inertia = inertia[:, kept]
     table, channels = np.ascontiguousarray(table[:, :, kept]), channels[:, kept]
@@ -359,9 +363,9 @@ def solve_modal_line(structure: Structure) -> tuple[ModalLine, LineForms]:
         channel_residual=_channel_residual(
             structure,
             inverse,
-            channels,
-            lambda x: structure.rail_rows(x) @ real @ vectors,
-            values,
+            known_channels,
+            lambda x: structure.rail_rows(x) @ real @ known,
+            known_values,
         ),
         channel_band=np.array([structure.channel_band(c) for c in scenario.channel]),
         length=structure.length,

@@ -56,8 +56,9 @@ from .traffic import Traffic
 
 SEGMENT_LENGTH = 24.0
 """Length (m) at which segments aim at 5 kHz; the modes of a line number length * sqrt(limit)."""
-WHOLE_LENGTH = 80.0
-"""Length (m) at 5 kHz up to which a line is solved whole: 72 m cost as much either way."""
+WHOLE_LENGTH = 110.0
+"""Length (m) at 5 kHz up to which a line is solved whole; there a step costs a third of what it
+costs in segments, but the modes take 45 s and 1.2 GB."""
 CUT_CLEARANCE = 2.0
 """Distance (m) that cuts keep, where they can, from bearings and channels."""
 JOINT = 6
@@ -413,23 +414,46 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _dot_pair(a, b, x, y):  # type: ignore[no-untyped-def]
-    """Two rows on two vectors."""
-    p, q, r, s = 0.0, 0.0, 0.0, 0.0
+def _dot_six(a, b, c, d, e, f, x, y, p, q):  # type: ignore[no-untyped-def]
+    """p += rows on x, q += rows on y, for the six rows of a joint."""
+    p0, p1, p2, p3, p4, p5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    q0, q1, q2, q3, q4, q5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(a.size):
-        p += a[k] * x[k]
-        q += a[k] * y[k]
-        r += b[k] * x[k]
-        s += b[k] * y[k]
-    return p, q, r, s
+        u, v = x[k], y[k]
+        p0 += a[k] * u
+        p1 += b[k] * u
+        p2 += c[k] * u
+        p3 += d[k] * u
+        p4 += e[k] * u
+        p5 += f[k] * u
+        q0 += a[k] * v
+        q1 += b[k] * v
+        q2 += c[k] * v
+        q3 += d[k] * v
+        q4 += e[k] * v
+        q5 += f[k] * v
+    p[0] += p0
+    p[1] += p1
+    p[2] += p2
+    p[3] += p3
+    p[4] += p4
+    p[5] += p5
+    q[0] += q0
+    q[1] += q1
+    q[2] += q2
+    q[3] += q3
+    q[4] += q4
+    q[5] += q5
 
 
 @njit(**KERNEL)
-def _add_pair(a, b, p, q, r, s, x, y):  # type: ignore[no-untyped-def]
-    """x += p a + r b, y += q a + s b."""
+def _add_six(a, b, c, d, e, f, p, q, x, y):  # type: ignore[no-untyped-def]
+    """x += p on rows, y += q on rows, for the six rows of a joint."""
+    p0, p1, p2, p3, p4, p5 = p[0], p[1], p[2], p[3], p[4], p[5]
+    q0, q1, q2, q3, q4, q5 = q[0], q[1], q[2], q[3], q[4], q[5]
     for k in range(a.size):
-        x[k] += p * a[k] + r * b[k]
-        y[k] += q * a[k] + s * b[k]
+        x[k] += p0 * a[k] + p1 * b[k] + p2 * c[k] + p3 * d[k] + p4 * e[k] + p5 * f[k]
+        y[k] += q0 * a[k] + q1 * b[k] + q2 * c[k] + q3 * d[k] + q4 * e[k] + q5 * f[k]
 
 
 @njit(**KERNEL)
@@ -622,17 +646,20 @@ def _march(  # type: ignore[no-untyped-def]
                     if on[i] and segment[i] == s:
                         displacement[i] = _dot(shape[i, :w], here)
             j = first_joint[s]
-            for side in range(2):
-                c = s - 1 + side
-                for row in range(0, sizes[s, side], 2):
-                    e, f, g, d = _dot_pair(
-                        joints[j : j + w], joints[j + w : j + 2 * w], here, here_mean
-                    )
-                    right[c, row] += e
-                    right[c, row + 1] += g
-                    right[c, half + row] += f
-                    right[c, half + row + 1] += d
-                    j += 2 * w
+            for c in range(max(s - 1, 0), min(s + 1, cuts)):
+                _dot_six(
+                    joints[j : j + w],
+                    joints[j + w : j + 2 * w],
+                    joints[j + 2 * w : j + 3 * w],
+                    joints[j + 3 * w : j + 4 * w],
+                    joints[j + 4 * w : j + 5 * w],
+                    joints[j + 5 * w : j + 6 * w],
+                    here,
+                    here_mean,
+                    right[c, :half],
+                    right[c, half:],
+                )
+                j += 6 * w
         _solve(inner, lower, upper, right, spare, cut)
         for u in range(kind.size):
             t = kind[u]
@@ -722,20 +749,20 @@ def _march(  # type: ignore[no-untyped-def]
             zeroth[a:b] = 0.0
             slope[a:b] = 0.0
             j = first_joint[s]
-            for side in range(2):
-                c = s - 1 + side
-                for row in range(0, sizes[s, side], 2):
-                    _add_pair(
-                        joints[j : j + w],
-                        joints[j + w : j + 2 * w],
-                        cut[c, row],
-                        cut[c, half + row],
-                        cut[c, row + 1],
-                        cut[c, half + row + 1],
-                        zeroth[a:b],
-                        slope[a:b],
-                    )
-                    j += 2 * w
+            for c in range(max(s - 1, 0), min(s + 1, cuts)):
+                _add_six(
+                    joints[j : j + w],
+                    joints[j + w : j + 2 * w],
+                    joints[j + 2 * w : j + 3 * w],
+                    joints[j + 3 * w : j + 4 * w],
+                    joints[j + 4 * w : j + 5 * w],
+                    joints[j + 5 * w : j + 6 * w],
+                    cut[c, :half],
+                    cut[c, half:],
+                    zeroth[a:b],
+                    slope[a:b],
+                )
+                j += 6 * w
             _turn_pair(
                 v[4, :h],
                 v[4, h:],
