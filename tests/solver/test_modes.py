@@ -227,6 +227,23 @@ def test_modes_without_participation_are_dropped():
     np.testing.assert_array_equal(bare, [False, False, False, True, True])
 
 
+def test_modes_dropped_below_the_limit_do_not_answer_statically(structure, line, monkeypatch):
+    # an expansion about rest is worthless above a mode's own frequency
+    limit = 2 * np.pi * structure.scenario.solution.frequency_limit
+
+    def every_other(values, *_):
+        return (abs(values) > limit) | (np.arange(len(values)) % 2 == 0)
+
+    monkeypatch.setattr(modes, "_participating", lambda values, *_: np.ones(len(values), bool))
+    whole = build_modal_line(structure).channel_residual
+    monkeypatch.setattr(modes, "_participating", every_other)
+    thinned = build_modal_line(structure)
+    assert len(thinned.eigenvalues) < len(line.eigenvalues)
+    np.testing.assert_allclose(
+        thinned.channel_residual, whole, atol=1e-9 * np.abs(whole).max(), rtol=1e-9
+    )
+
+
 def test_too_large_a_line_is_refused(structure, monkeypatch):
     monkeypatch.setattr(modes, "SIZE_LIMIT", 100)
     with pytest.raises(SolverError, match=r"has \d+ coordinates; limit of the modal solution 100"):
