@@ -47,6 +47,7 @@ from .modal import (
     Fleet,
     ModalRun,
     _step_unit,
+    aligned,
     exponential_weights,
     modal_run,
 )
@@ -188,38 +189,36 @@ def mean_weights(eigenvalues: Complex, step: float, order: int) -> tuple[Complex
 class SegmentTables:
     """Segments made ready for one step length; weights are folded into shapes as square roots.
 
-    Modes of a segment are padded to K, a multiple of 16; vectors hold re and im of its modes, then
-    those of the next segment.
+    Modes of a segment are padded to a multiple of 32, and to K of the largest where arrays hold
+    all segments; a complex value takes two places, re and im.
 
     Attributes:
-        first: (S + 1,) first value of each segment in the vectors; it has 2 K of them.
+        size: (S,) modes of each segment, padded.
         cell: (S + 1,) first cell of each segment. shape: (S,) its first value in ``shapes``.
-        shapes: cubic coefficients of the rail shapes, (cells, 4, 2 K) of one segment after another.
-        joint: (S,) first value of each segment in ``joints``.
-        joints: shapes of the severed coordinates, (J, 2 K) of one segment after the other, the
-            right-hand side of a cut with opposite sign.
-        sizes: (S, 2) severed coordinates at the left and right end of each segment.
-        vectors: (10, N) weights of modes (complex as re, im): E, d, a, -c/E of :mod:`modal`;
-            g0, g1 (:func:`mean_weights`); the mean's of q, p, p' and p''.
+        shapes: cubic coefficients of the rail shapes, (cells, 4, 2, size) of one segment after
+            another.
+        joints: (S, 12, 2, K) shapes of the severed coordinates at the left and right end of each
+            segment, the right-hand side of a cut with opposite sign; zero at the ends of the line.
+        vectors: (S, 9, 2, K) weights of modes: E; the mean's of y; g1 (:func:`mean_weights`); d;
+            the mean's of p' and p'' of the step to come; a and -c/E of :mod:`modal`; the mean's of
+            p.
         compliance: (cells, 2, 4) cubics of the rail's displacement per new force, joined, and of
             the residual compliance (m/N).
         reaction: (cells, 4, 4, 12) cubics of: displacement at a wheelset per lambda_0 and lambda_1,
             displacement at the severed coordinates per force, at the end of a step and in its mean.
         inner, lower, upper: (S - 1, 12, 12) factors of the matrix of the cuts.
         channel_segment: (O,) of the displacements of the C channels and then of what each owes to
-            accelerations; channel_first: (O,) first value in ``channel_weights``.
-        channel_weights: of each output, (2 K,).
+            accelerations; -1 if there is nothing.
+        channel_weights: (O, 2, K).
         channel_feed: (cells, 2, 4, O) as in :class:`ModalTables`.
-        grid_start: (S,). grid_step, length: m.
+        grid_start: (S,). grid_step, length, step: m, m, s.
     """
 
-    first: NDArray[np.int64]
+    size: NDArray[np.int64]
     cell: NDArray[np.int64]
     shape: NDArray[np.int64]
     shapes: NDArray[np.floating]
-    joint: NDArray[np.int64]
     joints: NDArray[np.floating]
-    sizes: NDArray[np.int64]
     vectors: Array
     compliance: Array
     reaction: Array
@@ -227,19 +226,19 @@ class SegmentTables:
     lower: Array
     upper: Array
     channel_segment: NDArray[np.int64]
-    channel_first: NDArray[np.int64]
-    channel_weights: Array
+    channel_weights: NDArray[np.floating]
     channel_feed: Array
     grid_start: Array
     grid_step: float
     length: float
+    step: float
 
 
 def _packed(values: Complex, size: int) -> Array:
-    """(..., K) complex to (..., 2 size) re then im."""
-    out = np.zeros((*values.shape[:-1], 2 * size))
-    out[..., : values.shape[-1]] = values.real
-    out[..., size : size + values.shape[-1]] = values.imag
+    """(..., K) complex to (..., 2, size), re and im."""
+    out = np.zeros((*values.shape[:-1], 2, size))
+    out[..., 0, : values.shape[-1]] = values.real
+    out[..., 1, : values.shape[-1]] = values.imag
     return out
 
 
@@ -253,16 +252,16 @@ def segment_tables(
     """Tables for a time step (s)."""
     parts = line.parts
     count = len(parts)
-    sizes = np.zeros((count, 2), np.int64)
-    sizes[:-1, 1] = sizes[1:, 0] = JOINT
     padded = [-(-len(part.eigenvalues) // LANES) * LANES for part in parts]
+    largest = max(padded)
     cells = [len(part.rail_shapes) for part in parts]
     blocks = np.zeros((3, max(count - 1, 0), BLOCK, BLOCK))
-    shapes, joints, vectors, compliance, reaction = [], [], [], [], []
+    shapes, compliance, reaction, feeds = [], [], [], []
+    joints = aligned((count, BLOCK, 2, largest), precision)
+    vectors = aligned((count, 9, 2, largest), np.float64)
     outputs = 2 * len(line.channel_x)
-    segment = np.zeros(outputs, np.int64)
-    weights: list[Array] = [np.zeros(2 * padded[0])] * outputs
-    feeds: list[Array] = []
+    segment = np.full(outputs, -1, np.int64)
+    weights = aligned((outputs, 2, largest), precision)
     thirds = np.vander(np.arange(4) / 3, increasing=True)
     for s, (part, size) in enumerate(zip(parts, padded, strict=True)):
         lam, root = part.eigenvalues, np.sqrt(part.weights)
@@ -270,74 +269,68 @@ def segment_tables(
         recall = -before / decay
         m, mn, ml, mb, g0, g1, k0, k1 = mean_weights(lam, step, order)
         rail = part.rail_shapes * root
-        joint: Complex = part.joint_shapes * root
-        joint[sizes[s, 0] :] *= -1
+        joint: Complex = np.zeros((BLOCK, len(lam)), complex)
+        joint[0 if s else JOINT : BLOCK if s < count - 1 else JOINT] = part.joint_shapes * root
+        joint[JOINT:] *= -1
         # both directions take the same rounded numbers, or work would be made
-        rounded = _packed(joint, size).astype(precision)
-        joints.append(rounded.ravel())
-        joint = rounded[:, : len(lam)] + 1j * rounded[:, size : size + len(lam)].astype(float)
+        joints[s] = _packed(joint, largest)
+        joint = joints[s, :, 0, : len(lam)] + 1j * joints[s, :, 1, : len(lam)].astype(float)
         shapes.append(_packed(rail, size).astype(precision).ravel())
         drive = decay * now + last - recall
-        means = (m, m * now + ml, m * recall + mb)
-        vectors.append(_packed(np.stack([decay, drive, now, recall, g0, g1, *means, mn]), size))
+        rows = (decay, m, g1, drive, m * now + ml, m * recall + mb, now, recall, mn)
+        vectors[s] = _packed(np.stack(rows), largest)
         own = np.stack([((thirds @ rail) ** 2 @ now).real, np.zeros(rail.shape[:2])], axis=1)
         own[:, 0] = own[:, 0] @ np.linalg.inv(thirds).T
         own[:, 1] = part.residual
         compliance.append(own)
         pair = np.zeros((len(rail), 4, 4, BLOCK))
-        side = len(joint)
         for row, factor in enumerate((g0, g1, now, mn)):
-            pair[:, :, row, :side] = (rail @ (joint * factor).T).real
+            pair[:, :, row] = (rail @ (joint * factor).T).real
         reaction.append(pair)
         gram = np.array(
             [[((joint * f) @ joint.T).real for f in row] for row in ((g0, g1), (k0, k1))]
         )
-        left = sizes[s, 0]
+        left, right = slice(0, JOINT), slice(JOINT, BLOCK)
         for a, b, first, second in (
-            (s - 1, s - 1, slice(0, left), slice(0, left)),
-            (s, s, slice(left, side), slice(left, side)),
-            (s, s - 1, slice(left, side), slice(0, left)),
-            (s - 1, s, slice(0, left), slice(left, side)),
+            (s - 1, s - 1, left, left),
+            (s, s, right, right),
+            (s, s - 1, right, left),
+            (s - 1, s, left, right),
         ):
             if min(a, b) < 0 or max(a, b) >= count - 1:
                 continue
             # diagonal, lower (row cut below), upper
             kind, at = (0, a) if a == b else ((1, a) if a > b else (2, a))
-            half = BLOCK // 2
-            for i in range(2):
-                for j in range(2):
-                    block = gram[i, j][first, second]
-                    target = blocks[kind, at, i * half :, j * half :]
-                    target[: block.shape[0], : block.shape[1]] += block
+            for i, end in enumerate((left, right)):
+                for j, value in enumerate((left, right)):
+                    blocks[kind, at, end, value] += gram[i, j][first, second]
         motion = part.channel_shapes - part.channel_inertia * lam**2
         channel: Complex = np.concatenate([motion, part.channel_inertia]) * root
         feeds.append(
             np.stack([(rail @ (channel * factor).T).real for factor in (now, recall)], axis=1)
         )
         for c in np.flatnonzero(abs(channel).max(axis=1, initial=0.0) > 0):
-            segment[c], weights[c] = s, _packed(channel[c], size)
+            segment[c], weights[c] = s, _packed(channel[c], largest)
     inner, lower, upper = _factor(blocks)
     tables = SegmentTables(
-        first=np.cumsum([0, *(2 * size for size in padded)]),
+        size=np.array(padded),
         cell=np.cumsum([0, *cells]),
         shape=np.cumsum([0, *(len(part) for part in shapes)])[:-1],
         shapes=np.concatenate(shapes),
-        joint=np.cumsum([0, *(len(part) for part in joints)])[:-1],
-        joints=np.concatenate(joints),
-        sizes=sizes,
-        vectors=np.concatenate(vectors, axis=1),
+        joints=joints,
+        vectors=vectors,
         compliance=np.concatenate(compliance),
         reaction=np.concatenate(reaction),
         inner=inner,
         lower=lower,
         upper=upper,
         channel_segment=segment,
-        channel_first=np.cumsum([0, *(len(row) for row in weights)])[:-1],
-        channel_weights=np.concatenate([np.zeros(0), *weights]),
+        channel_weights=weights,
         channel_feed=np.concatenate(feeds),
         grid_start=np.array([part.grid_start for part in parts]),
         grid_step=parts[0].grid_step,
         length=line.length,
+        step=step,
     )
     _join_compliance(tables, blocks, thirds)
     return tables
@@ -365,7 +358,7 @@ def _join_compliance(tables: SegmentTables, blocks: Array, thirds: Array) -> Non
     diagonal, below, above = blocks
     half = BLOCK // 2
     inverse = np.linalg.inv(thirds).T
-    for s in range(len(tables.sizes)):
+    for s in range(len(tables.size)):
         cuts = [c for c in range(s - 3, s + 3) if 0 <= c < len(diagonal)]
         matrix = np.zeros((len(cuts), BLOCK, len(cuts), BLOCK))
         for i, c in enumerate(cuts):
@@ -374,18 +367,13 @@ def _join_compliance(tables: SegmentTables, blocks: Array, thirds: Array) -> Non
                 matrix[i, :, i - 1], matrix[i - 1, :, i] = below[c], above[c - 1]
         flat = matrix.reshape(len(cuts) * BLOCK, -1)
         full = np.linalg.inv(flat)
-        left, right = tables.sizes[s]
-        rows = []
-        for c, size in ((s - 1, left), (s, right)):
-            if size:
-                at = cuts.index(c) * BLOCK
-                rows += list(range(at, at + size))
-        ends = np.array(rows, int)
+        own = [(c, half * side) for side, c in enumerate((s - 1, s)) if c in cuts]
+        ends = np.array([cuts.index(c) * BLOCK + i for c, _ in own for i in range(half)], int)
+        kept = np.array([first + i for _, first in own for i in range(half)], int)
         both = np.r_[ends, ends + half]
         reduced = full[np.ix_(both, both)]
         cell = slice(tables.cell[s], tables.cell[s + 1])
-        side = left + right
-        there = tables.reaction[cell][..., :side]
+        there = tables.reaction[cell][..., kept]
         at_thirds = np.einsum("tp,cpkj->ctkj", thirds, there)
         wheel = np.concatenate([at_thirds[:, :, 0], at_thirds[:, :, 1]], axis=-1)
         joint = np.concatenate([at_thirds[:, :, 2], at_thirds[:, :, 3]], axis=-1)
@@ -393,120 +381,175 @@ def _join_compliance(tables: SegmentTables, blocks: Array, thirds: Array) -> Non
         tables.compliance[cell, 0] -= reaction @ inverse
 
 
+# As in modal, arrays come whole: a slice costs as much as the work on 100 modes.
 @njit(**KERNEL)
-def _shape_at(c0, c1, c2, c3, s, shape):  # type: ignore[no-untyped-def]
-    for k in range(shape.size):
-        shape[k] = c0[k] + s * (c1[k] + s * (c2[k] + s * c3[k]))
+def _add_shape(shapes, s, size, force, i, shape, load):  # type: ignore[no-untyped-def]
+    """Rail shape of wheelset i, at s in a cell, and its load."""
+    for part in range(2):
+        for k in range(size):
+            v = shapes[0, part, k] + s * (
+                shapes[1, part, k] + s * (shapes[2, part, k] + s * shapes[3, part, k])
+            )
+            shape[i, part, k] = v
+            load[part, k] += force * v
 
 
 @njit(**KERNEL)
-def _add(shape, force, load):  # type: ignore[no-untyped-def]
-    for k in range(load.size):
-        load[k] += force * shape[k]
+def _add_load(shape, i, size, force, load):  # type: ignore[no-untyped-def]
+    for part in range(2):
+        for k in range(size):
+            load[part, k] += force * shape[i, part, k]
 
 
 @njit(**KERNEL)
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _clear(values, size):  # type: ignore[no-untyped-def]
+    for part in range(2):
+        for k in range(size):
+            values[part, k] = 0.0
+
+
+@njit(**KERNEL)
+def _dot(weights, i, size, values):  # type: ignore[no-untyped-def]
     total = 0.0
-    for k in range(a.size):
-        total += a[k] * b[k]
+    for part in range(2):
+        for k in range(size):
+            total += weights[i, part, k] * values[part, k]
     return total
 
 
 @njit(**KERNEL)
-def _dot_six(a, b, c, d, e, f, x, y, p, q):  # type: ignore[no-untyped-def]
-    """p += rows on x, q += rows on y, for the six rows of a joint."""
+def _read_gaps(joints, s, first, size, here, here_mean, at, right, c):  # type: ignore[no-untyped-def]
+    """Gaps of the six coordinates of a cut, at the end of a step and in its mean."""
     p0, p1, p2, p3, p4, p5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     q0, q1, q2, q3, q4, q5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(a.size):
-        u, v = x[k], y[k]
-        p0 += a[k] * u
-        p1 += b[k] * u
-        p2 += c[k] * u
-        p3 += d[k] * u
-        p4 += e[k] * u
-        p5 += f[k] * u
-        q0 += a[k] * v
-        q1 += b[k] * v
-        q2 += c[k] * v
-        q3 += d[k] * v
-        q4 += e[k] * v
-        q5 += f[k] * v
-    p[0] += p0
-    p[1] += p1
-    p[2] += p2
-    p[3] += p3
-    p[4] += p4
-    p[5] += p5
-    q[0] += q0
-    q[1] += q1
-    q[2] += q2
-    q[3] += q3
-    q[4] += q4
-    q[5] += q5
+    for part in range(2):
+        for k in range(size):
+            u, v = here[at, part, k], here_mean[at, part, k]
+            a, b = joints[s, first, part, k], joints[s, first + 1, part, k]
+            d, e = joints[s, first + 2, part, k], joints[s, first + 3, part, k]
+            f, g = joints[s, first + 4, part, k], joints[s, first + 5, part, k]
+            p0 += a * u
+            p1 += b * u
+            p2 += d * u
+            p3 += e * u
+            p4 += f * u
+            p5 += g * u
+            q0 += a * v
+            q1 += b * v
+            q2 += d * v
+            q3 += e * v
+            q4 += f * v
+            q5 += g * v
+    right[c, 0] += p0
+    right[c, 1] += p1
+    right[c, 2] += p2
+    right[c, 3] += p3
+    right[c, 4] += p4
+    right[c, 5] += p5
+    right[c, 6] += q0
+    right[c, 7] += q1
+    right[c, 8] += q2
+    right[c, 9] += q3
+    right[c, 10] += q4
+    right[c, 11] += q5
 
 
 @njit(**KERNEL)
-def _add_six(a, b, c, d, e, f, p, q, x, y):  # type: ignore[no-untyped-def]
-    """x += p on rows, y += q on rows, for the six rows of a joint."""
-    p0, p1, p2, p3, p4, p5 = p[0], p[1], p[2], p[3], p[4], p[5]
-    q0, q1, q2, q3, q4, q5 = q[0], q[1], q[2], q[3], q[4], q[5]
-    for k in range(a.size):
-        x[k] += p0 * a[k] + p1 * b[k] + p2 * c[k] + p3 * d[k] + p4 * e[k] + p5 * f[k]
-        y[k] += q0 * a[k] + q1 * b[k] + q2 * c[k] + q3 * d[k] + q4 * e[k] + q5 * f[k]
+def _pull(joints, s, first, size, cut, c, keep, sums):  # type: ignore[no-untyped-def]
+    """Modal loads of lambda_0 and lambda_1 of a cut; keep = 0 forgets what the sums held."""
+    p0, p1, p2, p3, p4, p5 = cut[c, 0], cut[c, 1], cut[c, 2], cut[c, 3], cut[c, 4], cut[c, 5]
+    q0, q1, q2, q3, q4, q5 = cut[c, 6], cut[c, 7], cut[c, 8], cut[c, 9], cut[c, 10], cut[c, 11]
+    for part in range(2):
+        for k in range(size):
+            a, b = joints[s, first, part, k], joints[s, first + 1, part, k]
+            d, e = joints[s, first + 2, part, k], joints[s, first + 3, part, k]
+            f, g = joints[s, first + 4, part, k], joints[s, first + 5, part, k]
+            zeroth = p0 * a + p1 * b + p2 * d + p3 * e + p4 * f + p5 * g
+            slope = q0 * a + q1 * b + q2 * d + q3 * e + q4 * f + q5 * g
+            sums[0, part, k] = keep * sums[0, part, k] + zeroth
+            sums[1, part, k] = keep * sums[1, part, k] + slope
 
 
 @njit(**KERNEL)
-def _turn(w_re, w_im, p, q, re, im):  # type: ignore[no-untyped-def]
-    """Add weight times load to a state that holds -im."""
-    for k in range(re.size):
-        re[k] += w_re[k] * p[k] - w_im[k] * q[k]
-        im[k] -= w_re[k] * q[k] + w_im[k] * p[k]
+def _carry(vectors, s, size, step, sums, modal, mean, seen):  # type: ignore[no-untyped-def]
+    """Cut forces on the state y, which ends its step; then z = m y, y = E y. All hold -im."""
+    for k in range(size):
+        p, q, r, t = sums[0, 0, k], sums[0, 1, k], sums[1, 0, k], sums[1, 1, k]
+        a, b = vectors[s, 1, 0, k], vectors[s, 1, 1, k]
+        c, d = vectors[s, 2, 0, k], vectors[s, 2, 1, k]
+        e, f = vectors[s, 0, 0, k], vectors[s, 0, 1, k]
+        # g0 = step m
+        x = modal[s, 0, k] + step * (a * p - b * q) + c * r - d * t
+        y = modal[s, 1, k] - step * (a * q + b * p) - c * t - d * r
+        seen[0, k] = x
+        seen[1, k] = y
+        mean[s, 0, k] = a * x + b * y
+        mean[s, 1, k] = a * y - b * x
+        modal[s, 0, k] = e * x + f * y
+        modal[s, 1, k] = e * y - f * x
 
 
 @njit(**KERNEL)
-def _turn_pair(a_re, a_im, b_re, b_im, p, q, r, s, re, im):  # type: ignore[no-untyped-def]
-    for k in range(re.size):
-        re[k] += a_re[k] * p[k] - a_im[k] * q[k] + b_re[k] * r[k] - b_im[k] * s[k]
-        im[k] -= a_re[k] * q[k] + a_im[k] * p[k] + b_re[k] * s[k] + b_im[k] * r[k]
+def _drive(vectors, s, size, new, load, modal, mean):  # type: ignore[no-untyped-def]
+    """Forces of the wheelsets on y and z; the new load becomes the last one."""
+    for k in range(size):
+        p, q, r, t = new[0, k], new[1, k], load[s, 0, k], load[s, 1, k]
+        a, b = vectors[s, 3, 0, k], vectors[s, 3, 1, k]
+        c, d = vectors[s, 4, 0, k], vectors[s, 4, 1, k]
+        e, f = vectors[s, 5, 0, k], vectors[s, 5, 1, k]
+        modal[s, 0, k] += a * p - b * q
+        modal[s, 1, k] -= a * q + b * p
+        mean[s, 0, k] += c * p - d * q + e * r - f * t
+        mean[s, 1, k] -= c * q + d * p + e * t + f * r
+        load[s, 0, k] = p
+        load[s, 1, k] = q
 
 
 @njit(**KERNEL)
-def _carry(e_re, e_im, m_re, m_im, re, im, z_re, z_im):  # type: ignore[no-untyped-def]
-    """z = m y, y = E y."""
-    for k in range(re.size):
-        x, y = re[k], im[k]
-        z_re[k] = m_re[k] * x + m_im[k] * y
-        z_im[k] = m_re[k] * y - m_im[k] * x
-        re[k] = e_re[k] * x + e_im[k] * y
-        im[k] = e_re[k] * y - e_im[k] * x
+def _predict(vectors, s, size, guess, load, modal, mean, here, here_mean):  # type: ignore[no-untyped-def]
+    """q at the end of the step and in its mean, with the wheelsets' forces guessed."""
+    for k in range(size):
+        p, q, r, t = guess[0, k], guess[1, k], load[s, 0, k], load[s, 1, k]
+        a, b = vectors[s, 6, 0, k], vectors[s, 6, 1, k]
+        c, d = vectors[s, 7, 0, k], vectors[s, 7, 1, k]
+        e, f = vectors[s, 8, 0, k], vectors[s, 8, 1, k]
+        here[0, 0, k] = modal[s, 0, k] + a * p - b * q + c * r - d * t
+        here[0, 1, k] = modal[s, 1, k] - a * q - b * p - c * t - d * r
+        here_mean[0, 0, k] = mean[s, 0, k] + e * p - f * q
+        here_mean[0, 1, k] = mean[s, 1, k] - e * q - f * p
 
 
 @njit(**KERNEL)
-def _cubics(c, s, out):  # type: ignore[no-untyped-def]
-    for j in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            out[j, k] = c[0, j, k] + s * (c[1, j, k] + s * (c[2, j, k] + s * c[3, j, k]))
+def _react(cubics, cell, s, i, react):  # type: ignore[no-untyped-def]
+    for row in range(4):
+        for j in range(BLOCK):
+            react[i, row, j] = cubics[cell, 0, row, j] + s * (
+                cubics[cell, 1, row, j]
+                + s * (cubics[cell, 2, row, j] + s * cubics[cell, 3, row, j])
+            )
 
 
 @njit(**KERNEL)
-def _cubic(c, s):  # type: ignore[no-untyped-def]
-    return c[0] + s * (c[1] + s * (c[2] + s * c[3]))
+def _cubic(c, cell, row, s):  # type: ignore[no-untyped-def]
+    return c[cell, row, 0] + s * (c[cell, row, 1] + s * (c[cell, row, 2] + s * c[cell, row, 3]))
 
 
 @njit(**KERNEL)
-def _feed(c, s, force, out):  # type: ignore[no-untyped-def]
-    for o in range(out.size):
-        out[o] += force * (c[0, o] + s * (c[1, o] + s * (c[2, o] + s * c[3, o])))
+def _feed(c, cell, row, s, force, outputs, n):  # type: ignore[no-untyped-def]
+    for o in range(outputs.shape[1]):
+        outputs[n, o] += force * (
+            c[cell, row, 0, o]
+            + s * (c[cell, row, 1, o] + s * (c[cell, row, 2, o] + s * c[cell, row, 3, o]))
+        )
 
 
 @njit(**KERNEL)
-def _subtract_product(matrix, x, out):  # type: ignore[no-untyped-def]
-    """out -= x @ matrix, row by row of the matrix."""
-    for j in range(x.size):
-        factor = x[j]
-        for i in range(out.size):
-            out[i] -= factor * matrix[j, i]
+def _subtract_product(matrix, c, x, d, out):  # type: ignore[no-untyped-def]
+    """out[c] -= x[d] @ matrix[c], row by row of the matrix."""
+    for j in range(BLOCK):
+        factor = x[d, j]
+        for i in range(BLOCK):
+            out[c, i] -= factor * matrix[c, j, i]
 
 
 @njit(**KERNEL)
@@ -514,25 +557,25 @@ def _solve(inner, lower, upper, right, spare, cut):  # type: ignore[no-untyped-d
     """cut = -(matrix of the cuts)^-1 right; the factors are transposed."""
     count = right.shape[0]
     for c in range(count):
-        spare[c] = right[c]
+        for i in range(BLOCK):
+            spare[c, i] = right[c, i]
         if c > 0:
-            _subtract_product(lower[c], spare[c - 1], spare[c])
+            _subtract_product(lower, c, spare, c - 1, spare)
     for c in range(count - 1, -1, -1):
-        cut[c] = 0.0
-        _subtract_product(inner[c], spare[c], cut[c])
+        for i in range(BLOCK):
+            cut[c, i] = 0.0
+        _subtract_product(inner, c, spare, c, cut)
         if c < count - 1:
-            _subtract_product(upper[c], cut[c + 1], cut[c])
+            _subtract_product(upper, c, cut, c + 1, cut)
 
 
 @njit(**KERNEL)
 def _march(  # type: ignore[no-untyped-def]
-    first,
+    size,
     first_cell,
     first_shape,
     shapes,
-    first_joint,
     joints,
-    sizes,
     vectors,
     compliance,
     reaction,
@@ -540,12 +583,12 @@ def _march(  # type: ignore[no-untyped-def]
     lower,
     upper,
     channel_segment,
-    channel_first,
     channel_weights,
     channel_feed,
     grid_start,
     grid_step,
     length,
+    step,
     modal,
     mean,
     load,
@@ -571,95 +614,110 @@ def _march(  # type: ignore[no-untyped-def]
     force,
     outputs,
 ):
-    parts, axles = sizes.shape[0], position.shape[1]
-    cuts, half = parts - 1, inner.shape[1] // 2
-    width = first[parts]
+    parts, (samples, axles) = size.shape[0], position.shape
+    cuts, largest = parts - 1, modal.shape[2]
     lost, worst = 0, 0.0
-    guess, next_load = np.zeros(width), np.zeros(width)
-    predicted, predicted_mean = np.zeros(width), np.zeros(width)
-    zeroth, slope = np.zeros(width), np.zeros(width)
-    right, spare = np.zeros((cuts, 2 * half)), np.zeros((cuts, 2 * half))
-    cut = np.zeros((cuts, 2 * half))
+    guess, new_load = np.zeros((2, largest), shapes.dtype), np.zeros((2, largest))
+    here, here_mean = np.zeros((1, 2, largest)), np.zeros((1, 2, largest))
+    sums, seen = np.zeros((2, 2, largest)), np.zeros((2, largest))
+    right, spare = np.zeros((cuts, BLOCK)), np.zeros((cuts, BLOCK))
+    cut = np.zeros((cuts, BLOCK))
     gap, own, displacement = np.zeros(axles), np.zeros(axles), np.zeros(axles)
     at, place, on = np.zeros(axles, np.int64), np.zeros(axles), np.zeros(axles, np.bool_)
-    react = np.zeros((axles, 4, 2 * half))
+    push, pushed = np.zeros(axles), np.zeros(axles, np.bool_)
+    react = np.zeros((axles, 4, BLOCK))
     scratch = np.empty(state.shape[1])
-    loaded, busy = np.zeros(parts, np.bool_), np.zeros(parts, np.bool_)
+    loaded = np.zeros(parts, np.bool_)
+    members, many = np.zeros((parts, axles), np.int64), np.zeros(parts, np.int64)
+    for i in range(axles):
+        members[segment[i], many[segment[i]]] = i
+        many[segment[i]] += 1
+    watching, watched = np.zeros((parts, outputs.shape[1]), np.int64), np.zeros(parts, np.int64)
+    for o in range(outputs.shape[1]):
+        s = channel_segment[o]
+        if s >= 0:
+            watching[s, watched[s]] = o
+            watched[s] += 1
     for s in range(parts):
-        for k in range(first[s], first[s + 1]):
-            if load[k] != 0.0:
-                loaded[s] = True
-    for n in range(position.shape[0]):
-        outputs[n] = 0.0
-        busy[:] = loaded
+        for part in range(2):
+            for k in range(size[s]):
+                if load[s, part, k] != 0.0:
+                    loaded[s] = True
+    # a turn is the last sample's forces on the modes, then the prediction and forces of this one
+    for n in range(samples + 1):
         any_on = False
-        for i in range(axles):
-            x = position[n, i]
-            on[i] = 0.0 <= x <= length
-            if on[i]:
-                any_on = True
-                s = segment[i]
-                busy[s] = True
-                w = first[s + 1] - first[s]
-                exact = (x - grid_start[s]) / grid_step
-                cell = min(max(int(exact), 0), first_cell[s + 1] - first_cell[s] - 1)
-                at[i], place[i] = first_cell[s] + cell, exact - cell
-                c = shapes[first_shape[s] + 4 * w * cell : first_shape[s] + 4 * w * (cell + 1)]
-                _shape_at(
-                    c[:w],
-                    c[w : 2 * w],
-                    c[2 * w : 3 * w],
-                    c[3 * w :],
-                    shapes.dtype.type(place[i]),
-                    shape[i, :w],
-                )
-                _cubics(reaction[at[i]], place[i], react[i])
-        right[:] = 0.0
+        if n < samples:
+            for o in range(outputs.shape[1]):
+                outputs[n, o] = 0.0
+            for i in range(axles):
+                x = position[n, i]
+                on[i] = 0.0 <= x <= length
+                if on[i]:
+                    any_on = True
+                    s = segment[i]
+                    exact = (x - grid_start[s]) / grid_step
+                    cell = min(max(int(exact), 0), first_cell[s + 1] - first_cell[s] - 1)
+                    at[i], place[i] = first_cell[s] + cell, exact - cell
+                    _react(reaction, at[i], place[i], i, react)
+            right[:] = 0.0
         for s in range(parts):
-            a, b = first[s], first[s + 1]
-            w, h = b - a, (first[s + 1] - first[s]) // 2
-            here, here_mean = modal[a:b], mean[a:b]
-            if busy[s]:
-                guess[a:b] = 0.0
-                for i in range(axles):
-                    if on[i] and segment[i] == s:
-                        _add(shape[i, :w], last_force[i], guess[a:b])
-                predicted[a:b] = modal[a:b]
-                predicted_mean[a:b] = mean[a:b]
-                here, here_mean = predicted[a:b], predicted_mean[a:b]
-                v = vectors[:, a:b]
-                p, q = guess[a : a + h], guess[a + h : b]
-                _turn_pair(
-                    v[2, :h],
-                    v[2, h:],
-                    v[3, :h],
-                    v[3, h:],
-                    p,
-                    q,
-                    load[a : a + h],
-                    load[a + h : b],
-                    here[:h],
-                    here[h:],
-                )
-                _turn(v[9, :h], v[9, h:], p, q, here_mean[:h], here_mean[h:])
-                for i in range(axles):
-                    if on[i] and segment[i] == s:
-                        displacement[i] = _dot(shape[i, :w], here)
-            j = first_joint[s]
-            for c in range(max(s - 1, 0), min(s + 1, cuts)):
-                _dot_six(
-                    joints[j : j + w],
-                    joints[j + w : j + 2 * w],
-                    joints[j + 2 * w : j + 3 * w],
-                    joints[j + 3 * w : j + 4 * w],
-                    joints[j + 4 * w : j + 5 * w],
-                    joints[j + 5 * w : j + 6 * w],
-                    here,
-                    here_mean,
-                    right[c, :half],
-                    right[c, half:],
-                )
-                j += 6 * w
+            w = size[s]
+            if n > 0:
+                if s > 0:
+                    _pull(joints, s, 0, w, cut, s - 1, 0.0, sums)
+                if s < cuts:
+                    _pull(joints, s, JOINT, w, cut, s, min(s, 1) * 1.0, sums)
+                _carry(vectors, s, w, step, sums, modal, mean, seen)
+                for m in range(watched[s]):
+                    o = watching[s, m]
+                    outputs[n - 1, o] += _dot(channel_weights, o, w, seen)
+                pushing = False
+                for m in range(many[s]):
+                    pushing = pushing or pushed[members[s, m]]
+                if pushing or loaded[s]:
+                    _clear(new_load, w)
+                    for m in range(many[s]):
+                        i = members[s, m]
+                        if pushed[i]:
+                            _add_load(shape, i, w, push[i], new_load)
+                    _drive(vectors, s, w, new_load, load, modal, mean)
+                loaded[s] = pushing
+            if n == samples:
+                continue
+            busy = loaded[s]
+            for m in range(many[s]):
+                busy = busy or on[members[s, m]]
+            if busy:
+                _clear(guess, w)
+                for m in range(many[s]):
+                    i = members[s, m]
+                    if on[i]:
+                        cell = first_shape[s] + 8 * w * (at[i] - first_cell[s])
+                        _add_shape(
+                            shapes[cell : cell + 8 * w].reshape(4, 2, w),
+                            shapes.dtype.type(place[i]),
+                            w,
+                            shapes.dtype.type(last_force[i]),
+                            i,
+                            shape,
+                            guess,
+                        )
+                _predict(vectors, s, w, guess, load, modal, mean, here, here_mean)
+                for m in range(many[s]):
+                    i = members[s, m]
+                    if on[i]:
+                        displacement[i] = _dot(shape, i, w, here[0])
+                if s > 0:
+                    _read_gaps(joints, s, 0, w, here, here_mean, 0, right, s - 1)
+                if s < cuts:
+                    _read_gaps(joints, s, JOINT, w, here, here_mean, 0, right, s)
+            else:
+                if s > 0:
+                    _read_gaps(joints, s, 0, w, modal, mean, s, right, s - 1)
+                if s < cuts:
+                    _read_gaps(joints, s, JOINT, w, modal, mean, s, right, s)
+        if n == samples:
+            break
         _solve(inner, lower, upper, right, spare, cut)
         for u in range(kind.size):
             t = kind[u]
@@ -680,35 +738,32 @@ def _march(  # type: ignore[no-untyped-def]
                 if 0.0 <= old <= length:
                     exact = (old - grid_start[s]) / grid_step
                     cell = min(max(int(exact), 0), first_cell[s + 1] - first_cell[s] - 1)
-                    _feed(
-                        channel_feed[first_cell[s] + cell, 1],
-                        exact - cell,
-                        last_force[i],
-                        outputs[n],
-                    )
+                    cell += first_cell[s]
+                    local = exact - (cell - first_cell[s])
+                    _feed(channel_feed, cell, 1, local, last_force[i], outputs, n)
                 if not on[i]:
                     force[n, i] = solve_contact(gap[i], own[i], linear[i], hertz[i])
                     continue
                 moved = displacement[i]
-                j = 0
                 for side in range(2):
-                    for row in range(sizes[s, side]):
-                        c = s - 1 + side
-                        moved += react[i, 0, j] * cut[c, row] + react[i, 1, j] * cut[c, half + row]
-                        j += 1
-                modes = _cubic(compliance[at[i], 0], place[i])
+                    c, j = s - 1 + side, JOINT * side
+                    if 0 <= c < cuts:
+                        for row in range(JOINT):
+                            moved += react[i, 0, j + row] * cut[c, row]
+                            moved += react[i, 1, j + row] * cut[c, JOINT + row]
+                modes = _cubic(compliance, at[i], 0, place[i])
                 gap[i] += modes * last_force[i] - moved
-                own[i] += modes + _cubic(compliance[at[i], 1], place[i])
+                own[i] += modes + _cubic(compliance, at[i], 1, place[i])
                 f = solve_contact(gap[i], own[i], linear[i], hertz[i])
                 force[n, i] = f
-                _feed(channel_feed[at[i], 0], place[i], f, outputs[n])
-                j = 0
+                _feed(channel_feed, at[i], 0, place[i], f, outputs, n)
                 for side in range(2):
-                    for row in range(sizes[s, side]):
-                        c = s - 1 + side
-                        right[c, row] += react[i, 2, j] * (f - last_force[i])
-                        right[c, half + row] += react[i, 3, j] * (f - last_force[i])
-                        j += 1
+                    c, j = s - 1 + side, JOINT * side
+                    if 0 <= c < cuts:
+                        for row in range(JOINT):
+                            change = f - last_force[i]
+                            right[c, row] += react[i, 2, j + row] * change
+                            right[c, JOINT + row] += react[i, 3, j + row] * change
             for a in range(count):
                 i = begin + a
                 f = force[n, i]
@@ -734,6 +789,7 @@ def _march(  # type: ignore[no-untyped-def]
                 i = begin + a
                 last_force[i] = force[n, i]
                 last_place[i] = position[n, i]
+                pushed[i], push[i] = on[i], force[n, i]
                 if on[i]:
                     if touching[i] and force[n, i] <= 0.0:
                         lost += 1
@@ -742,87 +798,6 @@ def _march(  # type: ignore[no-untyped-def]
                     force[n, i] = np.nan
         if any_on:
             _solve(inner, lower, upper, right, spare, cut)
-        for s in range(parts):
-            a, b = first[s], first[s + 1]
-            w, h = b - a, (first[s + 1] - first[s]) // 2
-            v, m = vectors[:, a:b], first[s] + (first[s + 1] - first[s]) // 2
-            zeroth[a:b] = 0.0
-            slope[a:b] = 0.0
-            j = first_joint[s]
-            for c in range(max(s - 1, 0), min(s + 1, cuts)):
-                _add_six(
-                    joints[j : j + w],
-                    joints[j + w : j + 2 * w],
-                    joints[j + 2 * w : j + 3 * w],
-                    joints[j + 3 * w : j + 4 * w],
-                    joints[j + 4 * w : j + 5 * w],
-                    joints[j + 5 * w : j + 6 * w],
-                    cut[c, :half],
-                    cut[c, half:],
-                    zeroth[a:b],
-                    slope[a:b],
-                )
-                j += 6 * w
-            _turn_pair(
-                v[4, :h],
-                v[4, h:],
-                v[5, :h],
-                v[5, h:],
-                zeroth[a:m],
-                zeroth[m:b],
-                slope[a:m],
-                slope[m:b],
-                modal[a:m],
-                modal[m:b],
-            )
-        for o in range(outputs.shape[1]):
-            s, k = channel_segment[o], channel_first[o]
-            a, b = first[s], first[s + 1]
-            outputs[n, o] += _dot(channel_weights[k : k + b - a], modal[a:b])
-        for s in range(parts):
-            a, b = first[s], first[s + 1]
-            w, h = b - a, (first[s + 1] - first[s]) // 2
-            m = a + h
-            v = vectors[:, a:b]
-            _carry(
-                v[0, :h],
-                v[0, h:],
-                v[6, :h],
-                v[6, h:],
-                modal[a:m],
-                modal[m:b],
-                mean[a:m],
-                mean[m:b],
-            )
-            if not busy[s]:
-                continue
-            next_load[a:b] = 0.0
-            loaded[s] = False
-            for i in range(axles):
-                if on[i] and segment[i] == s:
-                    loaded[s] = True
-                    _add(shape[i, :w], force[n, i], next_load[a:b])
-            _turn(
-                v[1, :h],
-                v[1, h:],
-                next_load[a:m],
-                next_load[m:b],
-                modal[a:m],
-                modal[m:b],
-            )
-            _turn_pair(
-                v[7, :h],
-                v[7, h:],
-                v[8, :h],
-                v[8, h:],
-                next_load[a:m],
-                next_load[m:b],
-                load[a:m],
-                load[m:b],
-                mean[a:m],
-                mean[m:b],
-            )
-            load[a:b] = next_load[a:b]
     return lost, worst
 
 
@@ -862,7 +837,6 @@ class SegmentRun(ModalRun):
             precision=precision,
             marching=self._march_segments,
         )
-        self._mean: Array = np.zeros(len(self._modal))
         self._seen: Fleet | None = None
         self._before: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
 
@@ -880,8 +854,9 @@ class SegmentRun(ModalRun):
         self.tables = segment_tables(
             self.line, self.traffic.step, order=order, precision=self._precision
         )
-        width = int(self.tables.first[-1])
-        self._modal, self._load = np.zeros(width), np.zeros(width)
+        width = (len(self.tables.size), 2, int(self.tables.size.max()))
+        self._modal, self._mean = aligned(width, np.float64), aligned(width, np.float64)
+        self._load = aligned(width, np.float64)
 
     @property
     def _outputs(self) -> int:
@@ -969,10 +944,8 @@ class SegmentRun(ModalRun):
             self._put(self._mean, s, ((-1 / lam - mn) * load + (-1 / lam - k0) * joint).conj())
 
     def _put(self, vector: NDArray[np.floating], segment: int, values: Complex) -> None:
-        a, b = self.tables.first[segment : segment + 2]
-        half = (b - a) // 2
-        vector[a : a + len(values)] += values.real
-        vector[a + half : a + half + len(values)] += values.imag
+        vector[segment, 0, : len(values)] += values.real
+        vector[segment, 1, : len(values)] += values.imag
 
     def _march_segments(
         self,
@@ -991,20 +964,18 @@ class SegmentRun(ModalRun):
         segment = self.line.where(fleet.place)
         if self._seen is not fleet:
             self._seen, self._before = fleet, (fleet.force.copy(), fleet.place.copy())
-        shape = np.empty((position.shape[1], int(np.diff(tables.first).max())), self._precision)
+        shape = aligned((position.shape[1], *modal.shape[1:]), self._precision)
         while begin < len(position):
             change = (number[begin:] != segment).any(axis=1)
             stop = begin + int(np.argmax(change)) + 1 if change.any() else len(position)
             part = slice(begin, stop)
             before = fleet.force.copy(), fleet.place.copy()
             more, residual = _march(
-                tables.first,
+                tables.size,
                 tables.cell,
                 tables.shape,
                 tables.shapes,
-                tables.joint,
                 tables.joints,
-                tables.sizes,
                 tables.vectors,
                 tables.compliance,
                 tables.reaction,
@@ -1012,12 +983,12 @@ class SegmentRun(ModalRun):
                 tables.lower,
                 tables.upper,
                 tables.channel_segment,
-                tables.channel_first,
                 tables.channel_weights,
                 tables.channel_feed,
                 tables.grid_start,
                 tables.grid_step,
                 tables.length,
+                tables.step,
                 modal,
                 self._mean,
                 load,
