@@ -58,8 +58,8 @@ from .traffic import Traffic
 SEGMENT_LENGTH = 24.0
 """Length (m) at which segments aim at 5 kHz; the modes of a line number length * sqrt(limit)."""
 WHOLE_LENGTH = 110.0
-"""Length (m) at 5 kHz up to which a line is solved whole; there a step costs a third of what it
-costs in segments, but the modes take 45 s and 1.2 GB."""
+"""Length (m) at 5 kHz up to which a line is solved whole; there a step costs half to four fifths of
+what it costs in segments, but the modes take 45 s and 1.2 GB, in segments 5 s."""
 CUT_CLEARANCE = 2.0
 """Distance (m) that cuts keep, where they can, from bearings and channels."""
 JOINT = 6
@@ -807,6 +807,10 @@ class SegmentRun(ModalRun):
     A wheelset acts on one segment. At the first sample beyond a cut it is handed over: what its
     force does to the modes, from that sample on, is moved from one segment to the next, so that
     the force on the joined line is interpolated as if there were no cut.
+
+    Args:
+        line, traffic, derivatives, order, precision: as of :class:`ModalRun`.
+        balance: an energy balance was asked for; there is none here, and the notes say so.
     """
 
     line: SegmentedLine  # type: ignore[assignment]
@@ -820,7 +824,9 @@ class SegmentRun(ModalRun):
         *,
         order: int = 2,
         precision: type[np.floating] = np.float32,
+        balance: bool = False,
     ) -> None:
+        self._balance_missing = balance
         self._rest_joint = _StaticJoint(line)
         self._weights = [
             (
@@ -844,11 +850,14 @@ class SegmentRun(ModalRun):
     def notes(self) -> tuple[str, ...]:
         """Sentences on what limits the result."""
         parts = len(self.line.parts)
-        return (
+        limits: tuple[str, ...] = (
             f"line of {self.line.length:g} m in {parts} segments: within 1 % of one whole line to "
             "0.4 of solution.frequency_limit; at the limit wheel force within 1 %, rail and slab "
             "beside a cut 10 %; wheel force at a cut 2 % of its range for a few steps",
         )
+        if self._balance_missing:
+            limits += ("energy balance: not available for a line in segments",)
+        return limits
 
     def _prepare(self, derivatives: tuple[int, ...], order: int) -> None:
         self.tables = segment_tables(
@@ -1067,8 +1076,11 @@ class _StaticJoint:
 def line_run(
     scenario: Scenario, traffic: Traffic, derivatives: tuple[int, ...], *, balance: bool
 ) -> ModalRun:
-    """Run of a scenario's line: whole if it is short, else in segments, without energy balance."""
+    """Run of a scenario's line: whole if it is short, else in segments.
+
+    Segments have no energy balance; if it is asked for, the run's notes say that it is missing.
+    """
     cuts = find_cuts(scenario)
     if not cuts:
         return modal_run(scenario, traffic, derivatives, balance=balance)
-    return SegmentRun(segmented_line(scenario, cuts), traffic, derivatives)
+    return SegmentRun(segmented_line(scenario, cuts), traffic, derivatives, balance=balance)

@@ -79,6 +79,7 @@ class Simulation:
             train that has left is forgotten, so that a run without end keeps its cost and memory.
         balance: balance the line's energy too where that is not had for nothing: with exponential
             steps. The modes are then computed anew, and stepping costs about three times as much.
+            A line in segments has none; its quality then says so.
         report: called with one-line messages on what is being prepared.
 
     Raises:

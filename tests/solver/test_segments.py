@@ -312,14 +312,15 @@ def test_a_train_longer_than_a_segment_over_three_spans(monkeypatch):
         irregularity={},
         solution={"frequency_limit": 400.0, "end_time": 0.9},
     )
-    sim = Simulation(scenario, outputs=("displacement",))
+    sim = Simulation(scenario, outputs=("displacement",), balance=True)
     assert isinstance(sim._run, SegmentRun)
     shown = np.concatenate([block.displacement for block in sim.blocks(1000)])
     quality = sim.quality
     assert quality.lost_contacts == 0
     assert quality.equilibrium_residual < 1e-9
     assert quality.energy_residual is None
-    assert any("segments" in note for note in quality.notes)
+    assert any("m in 5 segments" in note for note in quality.notes)
+    assert "energy balance: not available for a line in segments" in quality.notes
     monkeypatch.setattr(segments, "WHOLE_LENGTH", 1e9)
     reference = line_run(scenario, Traffic(scenario), (0,), balance=False)
     assert not isinstance(reference, SegmentRun)
