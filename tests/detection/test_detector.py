@@ -145,7 +145,9 @@ def test_gaps_between_blocks_are_dropouts():
     events = [event for block in kept for event in detector.process(block)]
     (passage,) = passages(events + detector.finish())
     assert passage.values["axle_count"] == 32
-    assert passage.values["speed"].value == pytest.approx(60.0, rel=4e-3)
+    # drop-outs spoil windows: CRH3 and CRH2, 0.9 % apart in size, may then not be told apart
+    speed = passage.values["speed"]
+    assert abs(speed.value - 60.0) < 2 * speed.sigma < 2 * 60.0 * 0.009
     assert "gaps" in passage.quality
 
 

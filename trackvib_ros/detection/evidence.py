@@ -44,6 +44,7 @@ _GAP_NEAR, _GAP_FAR = 0.2, 0.6  # m, spread of wheelbases and of the other gaps 
 _NEAR = 3.5  # m
 _CLOCK_S = 0.1
 _OUTLIER = 2.5
+_LEAST_COMMON = 0.75  # share of the places, so that what is left out can be accidents
 _COARSE = 0.2  # m, scatter at which nothing finer than a wheelbase can be told
 _COARSE_COST = 7.0  # ln of odds: its tails are not Gaussian and imitate other gaps
 _LEAST_SHARE = 0.6  # of the scatter about the best type that must be noise
@@ -107,16 +108,39 @@ def _noise(candidate: Candidate) -> float:
     return max(float(np.sqrt(square)), _LEAST_NOISE)
 
 
-def _model(candidate: Candidate, noise: float, effects: Sequence[Array]) -> tuple[float, Motion]:
+def _comparable(candidates: Sequence[Candidate], noise: float) -> dict[int, NDArray[np.bool_]]:
+    """(channels, wheelsets) by number of wheelsets: places that fit every candidate of that number.
+
+    Every candidate looks for its wheelsets in windows of its own; a pulse mistaken for a wheelset
+    in one of them is an accident, and must not choose between types that differ by a per cent.
+    Many such places are no accident but a wrong type: then all places count.
+    """
+    common: dict[int, NDArray[np.bool_]] = {}
+    for c in candidates:
+        if c.fit.scale > 2 * noise:
+            continue
+        count = c.places.size
+        good = c.fit.observed & (np.abs(c.fit.residual) <= _OUTLIER * noise)
+        common[count] = good & common[count] if count in common else good
+    return {
+        count: good
+        for count, good in common.items()
+        if good.sum() >= _LEAST_COMMON * min(c.fit.observed.sum() for c in candidates)
+    }
+
+
+def _model(
+    candidate: Candidate, noise: float, effects: Sequence[Array], seen: NDArray[np.bool_]
+) -> tuple[float, Motion]:
     """Log evidence against wheelsets anywhere, and the motion.
 
     Args:
         candidate: the type.
         noise: of a wheelset (m).
+        seen: (channels, wheelsets) that count.
         effects: random effects of unit variance on the places, each of shape (channels, wheelsets).
     """
     fit, start = candidate.fit, candidate.fit.motion
-    seen = fit.observed
     t = fit.time[seen] - start.epoch
     # what the first regression left, so that nothing large cancels
     rest = (candidate.places[None, :] + candidate.shifts[:, None])[seen]
@@ -152,9 +176,11 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     likely = [c for c in candidates if c.score > top - 2 * _SCORE_NOISE]
     # classes of few wheelsets understate it
     noise = max(min(_noise(c) for c in likely), _LEAST_SHARE * min(c.fit.scale for c in likely))
+    common = _comparable(likely, noise)
     found: list[tuple[float, int, Kind, int, Motion]] = []
     for index, c in enumerate(candidates):
         channels, axles = c.fit.observed.shape
+        use = c.fit.observed & common[axles] if axles in common else c.fit.observed
         classes = _classes(c.places)
         base: list[Array] = []
         for k in range(channels):
@@ -194,7 +220,7 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             effect[k] = _CLOCK_S * abs(c.fit.motion.speed)
             trials.append(("clock", k, float(np.log(PRIOR_CLOCK)), [effect]))
         for kind, channel, log_prior, more in trials:
-            log, motion = _model(c, noise, [*base, *more])
+            log, motion = _model(c, noise, [*base, *more], use)
             if motion.speed > 0:
                 found.append((log + prior + log_prior, index, kind, channel, motion))
     if not found:

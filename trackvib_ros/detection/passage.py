@@ -25,6 +25,13 @@ CONFIRM_SCORE = 0.60
 KNOWN_SCORE = 0.62
 """Least pattern correlation at which a catalogue type is named."""
 
+SCATTERED = 0.5
+"""Scatter (m) of wheelsets about their places at which these tell nothing: in windows of 2.2 m
+pulses that have nothing to do with the type scatter by 0.635 m."""
+
+SCATTERED_SCORE = 0.70
+"""Least pattern correlation at which a type is named by its pattern alone."""
+
 CONFIRM_CORRELATION = 0.6
 """Least correlation of the envelopes of two channels for a train of unknown type."""
 
@@ -106,12 +113,19 @@ class Passage:
     @property
     def known(self) -> bool:
         """Whether a catalogue type explains the pattern."""
-        return bool(self.hypotheses) and self.score >= KNOWN_SCORE and self.unknown < 0.5
+        return self._patterned(KNOWN_SCORE) and self.unknown < 0.5
+
+    def _patterned(self, least: float) -> bool:
+        """Whether a type's pattern is seen with this correlation, or clearly without wheelsets."""
+        if not self.hypotheses:
+            return False
+        scattered = self.hypotheses[0].fit.scale > SCATTERED
+        return self.score >= (SCATTERED_SCORE if scattered else least)
 
     @property
     def confirmed(self) -> bool:
         """Whether this is a train: by its pattern, or by what two channels agree on."""
-        if self.hypotheses and self.score >= CONFIRM_SCORE:
+        if self._patterned(CONFIRM_SCORE):
             return True
         blind = self.blind
         return (
