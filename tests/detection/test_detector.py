@@ -177,12 +177,12 @@ def test_clipping_at_a_fifth_of_the_peak():
 
 @pytest.mark.parametrize("gap", [1.5, 3.0])
 def test_two_trains_in_succession(gap):
-    first = Passage(CATALOGUE["CRH3"].axles, 70.0)
+    first = Passage(CATALOGUE["metro"].axles, 70.0)
     second = Passage(
         CATALOGUE["articulated"].axles, 60.0, start=first.axle_times(20.0)[-1] + gap, level=0.7
     )
     found = passages(run(record([first, second], RAILS, 20), RAILS))
-    assert [p.values["type"] for p in found] == ["CRH3", "articulated"]
+    assert [p.values["type"] for p in found] == ["metro", "articulated"]
     for passage, truth in zip(found, (first, second), strict=True):
         assert passage.values["speed"].value == pytest.approx(truth.mid_speed(), rel=4e-3)
 
