@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -16,8 +17,9 @@ from . import report
 from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .features import FRAME, GroupStream
+from .head import HeadMatcher
 from .health import HealthBook, clipped
-from .live import provisional
+from .live import Partial, departed, provisional
 from .onset import Trigger
 from .passage import Passage, Record, excited, find_passages
 
@@ -35,7 +37,13 @@ _RISEN = 1.6  # over the least level: another wheelset comes, 2 dB
 _HANG_LEAST_S, _HANG_FACTOR, _HANG_MORE_S = 1.0, 2.0, 0.5
 _HANG_LEARNT_NS = 1_000_000_000
 _UPDATE_NS = 200_000_000
+_UPDATE_GROWTH = 0.25  # of the time passed, between trials
 _UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
+_UPDATE_WHEELSETS = (4, 12)  # by pattern, on one channel
+_UPDATE_WITHIN = 100.0  # m at the lowest speed: what is not clear by then is no train
+_BEGUN = 4.0  # energy of the first half second over that after the event: it began before
+_AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
+_QUIET_NS = 1_000_000_000
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
@@ -90,7 +98,6 @@ class _Event:
     strongest: dict[int, float]
     least: dict[int, float]
     pause_ns: dict[int, int]
-    truncated: bool = False
     next_update_ns: int = 0
     updates: int = 0
 
@@ -125,6 +132,7 @@ class TrainDetector:
         if len(set(names)) != len(names):
             raise InputError(f"channel names must differ, not {', '.join(names)}")
         self._index = {name: i for i, name in enumerate(names)}
+        self._limits = (self.config.min_speed, self.config.max_speed)
         self.reset()
 
     def reset(self) -> None:
@@ -133,6 +141,7 @@ class TrainDetector:
         self._start_ns: int | None = None
         self._done_ns = 0
         self._event: _Event | None = None
+        self._beginning = True
         self._health = HealthBook(self.channels)
         self._lowest = np.full(len(self.channels), np.inf)
         self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
@@ -331,15 +340,18 @@ class TrainDetector:
             (event.start_ns - origin) * 1e-9 - 0.5,
             (last - origin) * 1e-9 + 0.3,
         )
-        flags = ["truncated_start"] if event.truncated else []
-        limits = (self.config.min_speed, self.config.max_speed)
-        found = find_passages(records, within, self.catalogue, limits, event.truncated)
+        first, self._beginning = self._beginning, False
+        if first and event.start_ns - (self._start_ns or 0) < _BEFORE_NS and self._louder_before():
+            part = self._truncated(last, now_ns)
+            if part is not None:
+                return part
+        found = find_passages(records, within, self.catalogue, self._limits)
         if records and not any(passage.confirmed for passage in found):
-            found, swapped = self._try_swapped(records, within, limits, found)
+            found, swapped = self._try_swapped(records, within, found)
         else:
             swapped = []
         events = self._passage_health(now_ns, records, within, found, swapped)
-        return events + report.closing(self.catalogue, records, origin, within, found, flags)
+        return events + report.closing(self.catalogue, records, origin, within, found)
 
     def _records(self, from_ns: int, to_ns: int) -> list[Record]:
         records = []
@@ -353,21 +365,58 @@ class TrainDetector:
         return records
 
     def _update(self, event: _Event, now_ns: int) -> list[TrainEvent]:
-        event.next_update_ns = now_ns + _UPDATE_NS
+        passed = now_ns - event.start_ns
+        event.next_update_ns = now_ns + max(_UPDATE_NS, round(_UPDATE_GROWTH * passed))
+        if passed * 1e-9 * self.config.min_speed > _UPDATE_WITHIN:
+            return []
         origin = event.start_ns - _BEFORE_NS
         within = ((event.start_ns - origin) * 1e-9 - 0.5, (now_ns - origin) * 1e-9)
-        limits = (self.config.min_speed, self.config.max_speed)
-        found = provisional(self._records(origin, now_ns), within, limits)
-        if found is None or found.distance < _UPDATE_AFTER[event.updates]:
+        found = provisional(self._rails(origin, now_ns), within, self._limits, self._heads)
+        if found is None or not _enough(found, event.updates):
             return []
         event.updates += 1
         return [report.update(found, now_ns)]
+
+    @cached_property
+    def _heads(self) -> HeadMatcher:
+        return HeadMatcher(self.catalogue.types, self._limits)
+
+    def _rails(self, from_ns: int, to_ns: int) -> list[Record]:
+        return [r for r in self._records(from_ns, to_ns) if r.channel.layer == "rail"]
+
+    def _louder_before(self) -> bool:
+        """Whether the noise learned at the start of the stream was none, by what is there now."""
+        for group in self._groups.values():
+            drop = group.trigger.first_floor / group.trigger.recent
+            for row, channel in enumerate(group.index):
+                if (
+                    self.channels[channel].layer == "rail"
+                    and np.nanmax(drop[row], initial=0) > _BEGUN
+                ):
+                    return True
+        return False
+
+    def _truncated(self, last_ns: int, now_ns: int) -> list[TrainEvent] | None:
+        """Events of a train whose beginning is not on record; ``None`` if that is not so."""
+        origin = self._start_ns or 0
+        records = []
+        for record in self._rails(origin, now_ns):
+            after = record.window.time > record.window.time[-1] - _QUIET_NS / 2e9
+            floor = np.maximum(np.median(record.window.energy[after], axis=0), 1e-300)
+            records.append(replace(record, floor=floor))
+        within = (0.0, (last_ns - origin) * 1e-9 + 0.3)
+        mirrored = HeadMatcher(self.catalogue.types, self._limits, mirrored=True)
+        found, quiet = departed(records, within, self._limits, mirrored)
+        if found is not None:
+            return report.truncated(self.catalogue, found, origin)
+        if quiet > _AT_ONCE_S:
+            return None
+        return report.unclear(records, last_ns, ("truncated_start",))
 
     def _try_swapped(
         self,
         records: list[Record],
         within: tuple[float, float],
-        limits: tuple[float, float],
         found: list[Passage],
     ) -> tuple[list[Passage], list[str]]:
         """Rail channels that show no wheelsets while others do: their cables are exchanged."""
@@ -378,7 +427,7 @@ class TrainDetector:
             for r in records
             if r.channel.layer != "rail"
         ]
-        instead = find_passages(others, within, self.catalogue, limits) if others else []
+        instead = find_passages(others, within, self.catalogue, self._limits) if others else []
         sure = [p for p in instead if p.known]
         return (sure, [trace.name for trace in sure[0].traces]) if sure else (found, [])
 
@@ -413,6 +462,12 @@ class TrainDetector:
                 values["clock_offset"] = Estimate(*offsets[name], "s")
             events += tell(now_ns, name, "unsynchronised", name in offsets, values)
         return events
+
+
+def _enough(found: Partial, updates: int) -> bool:
+    if found.types:
+        return found.wheelsets >= _UPDATE_WHEELSETS[updates]
+    return found.distance >= _UPDATE_AFTER[updates]
 
 
 def detect(

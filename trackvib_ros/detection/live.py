@@ -1,52 +1,95 @@
-"""A first speed while the train is still passing, from two rail channels."""
+"""What can be told of a train that is not on record as a whole: it still passes, or had begun."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .blind import envelope_delay
+from .head import Head, HeadMatcher
 from .kinematics import POSITION_SIGMA
 from .passage import Record, excited, strong_interval, traces_of
+from .pattern import Trace
 
 LEAST_CORRELATION = 0.6
 AXLE_SPACING = 6.2
 """Track per wheelset of a train on bogies (m), to count how many have passed."""
 _PULSE = 0.25  # m, place of one pulse
+_END_SIGMA = 0.6  # m, place of the last wheelset by the end of strong energy
+_CAR = 26.0  # m, a train shows its next bogie within a car
 
 
 @dataclass(frozen=True)
-class Provisional:
-    """Speed (m/s, sigma) and direction after ``distance`` (m) of the train has passed."""
+class Partial:
+    """Speed (m/s, sigma) by the part of a train that was seen.
+
+    Attributes:
+        speed: with ``sigma`` (m/s).
+        direction: +1, -1, or 0 unknown.
+        score: correlation, 0 to 1.
+        distance: length of train seen (m).
+        wheelsets: seen; estimated from the length if no pattern was compared.
+        sensors: channels used.
+        method: how the speed was obtained.
+        types: catalogue types with their probabilities; empty if no pattern was compared.
+        families: the same for families.
+        end: time (s) and sigma of the last wheelset at the first of the sensors; ``None`` while it
+            passes.
+        x: position of the first of the sensors (m).
+    """
 
     speed: float
     sigma: float
     direction: int
-    correlation: float
+    score: float
     distance: float
-    sensors: tuple[str, str]
+    wheelsets: int
+    sensors: tuple[str, ...]
+    method: str
+    types: tuple[tuple[str, float], ...] = ()
+    families: tuple[tuple[str, float], ...] = ()
+    end: tuple[float, float] | None = None
+    x: float = 0.0
 
 
 def provisional(
-    records: Sequence[Record], within: tuple[float, float], limits: tuple[float, float]
-) -> Provisional | None:
-    """Speed by the delay between the outer two rail channels; ``None`` while it is not clear."""
+    records: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    matcher: HeadMatcher,
+) -> Partial | None:
+    """Speed while the train passes: by the delay between the outer two rail channels, or by the
+    axle pattern if only one has a signal. ``None`` while it is not clear.
+    """
     rails = sorted(
         (r for r in records if r.channel.layer == "rail" and excited(r, within)),
         key=lambda r: r.channel.x,
     )
-    if len(rails) < 2 or rails[-1].channel.x - rails[0].channel.x < 2.0:
+    if len(rails) >= 2 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
+        return _by_delay(rails[0], rails[-1], within, limits)
+    if not rails:
         return None
-    a, b = rails[0], rails[-1]
-    best: Provisional | None = None
-    for band, (low, high) in enumerate(a.window.bands[: len(b.window.bands)]):
-        first, second = traces_of(a, within)[band], traces_of(b, within)[band]
+    found = _by_pattern(rails[0], within, matcher)
+    # the others may only not have been reached yet
+    reach = max(abs(r.channel.x - rails[0].channel.x) for r in records)
+    return found if found is not None and found.distance > 1.5 * reach else None
+
+
+def _by_delay(
+    a: Record, b: Record, within: tuple[float, float], limits: tuple[float, float]
+) -> Partial | None:
+    best: Partial | None = None
+    for first, second, (low, high) in zip(
+        traces_of(a, within), traces_of(b, within), a.window.bands, strict=False
+    ):
         found = envelope_delay(first, second, within, limits)
         if found is None or found[1] < LEAST_CORRELATION:
             continue
         delay, correlation = found
+        if best is not None and correlation <= best.score:
+            continue
         baseline = b.channel.x - a.channel.x
         speed = baseline / abs(delay)
         # what both channels have seen of the train
@@ -57,13 +100,124 @@ def provisional(
         distance = speed * (within[1] - interval[0])
         wheelsets = max(1.0, distance / AXLE_SPACING)
         sigma = speed * np.sqrt(2 * (POSITION_SIGMA**2 + _PULSE**2 / wheelsets)) / baseline
-        if best is None or correlation > best.correlation:
-            best = Provisional(
-                speed,
-                float(sigma),
-                1 if delay > 0 else -1,
-                correlation,
-                distance,
-                (a.channel.name, b.channel.name),
-            )
+        best = Partial(
+            speed,
+            float(sigma),
+            1 if delay > 0 else -1,
+            correlation,
+            distance,
+            int(wheelsets),
+            (a.channel.name, b.channel.name),
+            "delay of the envelope between two rail channels",
+            x=a.channel.x,
+        )
     return best
+
+
+def _by_pattern(
+    record: Record, within: tuple[float, float], matcher: HeadMatcher
+) -> Partial | None:
+    best: Head | None = None
+    for trace, (low, high) in zip(traces_of(record, within), record.window.bands, strict=True):
+        interval = strong_interval(trace, high - low, within)
+        head = interval and matcher.match(trace, interval[0], within[1])
+        if head and (best is None or head.score > best.score):
+            best = head
+    if best is None or not best.clear:
+        return None
+    return Partial(
+        best.speed,
+        best.sigma,
+        0,
+        best.score,
+        best.distance,
+        best.passed,
+        (record.channel.name,),
+        "axle pattern of the first wheelsets",
+        best.types,
+        best.families,
+        x=record.channel.x,
+    )
+
+
+def _mirrored(trace: Trace) -> Trace:
+    """The trace in reversed time, so that the last wheelset comes first."""
+    return Trace(
+        trace.name,
+        trace.x,
+        -trace.time[::-1],
+        trace.energy[::-1],
+        trace.valid[::-1],
+        trace.noise,
+        trace.step,
+    )
+
+
+def departed(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    mirrored: HeadMatcher,
+) -> tuple[Partial | None, float]:
+    """A train whose beginning is not on record, by the pattern of its end.
+
+    Args:
+        records: of the rail channels, with the noise after the train as floor.
+        within: start of the record, end of the event (s).
+        limits: speeds (m/s).
+        mirrored: for trains read from their end.
+
+    Returns:
+        ``None`` if it shows no clear pattern; and how long the record is quiet at its start (s),
+        infinite if that is longer than a train is.
+    """
+    rails = sorted((r for r in records if excited(r, within)), key=lambda r: r.channel.x)
+    best: tuple[Head, Record, tuple[float, float]] | None = None
+    for record in rails:
+        start = max(within[0], float(record.window.time[0]))
+        for trace, (low, high) in zip(traces_of(record, within), record.window.bands, strict=True):
+            interval = strong_interval(trace, high - low, within)
+            if interval is None:
+                continue
+            head = mirrored.match(_mirrored(trace), -interval[1], -start)
+            if head and (best is None or head.score > best[0].score):
+                best = head, record, (interval[0] - start, -head.start)
+    if best is None:
+        return None, np.inf
+    head, record, (quiet, end) = best
+    if not best[0].clear:
+        return None, quiet
+    if head.speed * quiet > _CAR:
+        return None, np.inf
+    found = Partial(
+        head.speed,
+        head.sigma,
+        0,
+        head.score,
+        head.distance,
+        head.passed,
+        (record.channel.name,),
+        "axle pattern of the end of the train",
+        head.types,
+        head.families,
+        (end, float(np.hypot(_END_SIGMA / head.speed, 0.005))),
+        record.channel.x,
+    )
+    delay = None
+    if len(rails) > 1 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
+        delay = _by_delay(rails[0], rails[-1], within, limits)
+    if delay is None or abs(delay.speed - found.speed) > 3 * np.hypot(delay.sigma, found.sigma):
+        return found, quiet
+    weight = np.array([found.sigma, delay.sigma]) ** -2.0
+    others = tuple(name for name in delay.sensors if name not in found.sensors)
+    speed = float(weight @ [found.speed, delay.speed] / weight.sum())
+    fused = replace(
+        found,
+        speed=speed,
+        distance=found.distance * speed / found.speed,
+        sigma=float(weight.sum() ** -0.5),
+        direction=delay.direction,
+        sensors=(*found.sensors, *others),
+        method=f"{found.method}, {delay.method}",
+    )
+    return fused, quiet

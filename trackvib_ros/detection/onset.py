@@ -42,6 +42,8 @@ class Trigger:
         floor: energy of the noise, (channels, bands).
         ratio: energy over threshold, the largest of windows and bands, per channel.
         band: the band of ``ratio``.
+        first_floor: the floor as it was first learned.
+        recent: mean energy over the longest window.
         level: energy of the longest window over the floor, the largest of the bands.
         active: ``ratio`` > 1.
         fall_db: by how much the floor has fallen since it was first learned.
@@ -61,8 +63,9 @@ class Trigger:
         self.band = np.zeros(channels, dtype=np.int64)
         self._history = np.zeros((WINDOWS[-1], *shape))
         self._filled = np.zeros(channels, dtype=np.int64)
+        self.recent = np.full(shape, np.nan)
         self._warm = np.full((_WARM_UP, *shape), np.nan)
-        self._first_floor = np.full(shape, np.nan)
+        self.first_floor = np.full(shape, np.nan)
 
     def ready(self) -> NDArray[np.bool_]:
         """Which channels have learned a floor."""
@@ -88,7 +91,7 @@ class Trigger:
                 self.seen[c] += 1
                 if self.seen[c] == _WARM_UP:
                     self.floor[c] = np.median(self._warm[:, c], axis=0)
-                    self._first_floor[c] = self.floor[c]
+                    self.first_floor[c] = self.floor[c]
         ready = self.seen >= _WARM_UP
         if not ready.any():
             return self.active
@@ -102,6 +105,7 @@ class Trigger:
                 self.band = np.where(peak > excess, band, self.band)
                 np.maximum(excess, peak, out=excess)
             self.level = np.nanmax(mean, axis=1, initial=0.0)
+            self.recent = mean * self.floor
         self.ratio = np.where(usable & ready, excess, 0.0)
         self.active = self.ratio > 1.0
         learn = usable & ready & ~self.active
@@ -111,12 +115,12 @@ class Trigger:
             weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, 1 / _FLOOR_FRAMES)
             self.floor[learn] *= 1 + weight * (np.minimum(excess_energy, 4.0) - 1)
             self.fall_db[learn] = np.max(
-                10 * np.log10(self._first_floor[learn] / self.floor[learn]), axis=1
+                10 * np.log10(self.first_floor[learn] / self.floor[learn]), axis=1
             )
         return self.active
 
     def relearn(self, channel: int) -> None:
         """Forget the floor of a channel."""
         self.seen[channel] = 0
-        self._first_floor[channel] = np.nan
+        self.first_floor[channel] = np.nan
         self.active[channel] = False

@@ -212,7 +212,6 @@ def _scan_channel(
     within: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
-    truncated: bool,
 ) -> _Scanned | None:
     found = []
     traces = traces_of(record, within)
@@ -220,8 +219,7 @@ def _scan_channel(
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
-        stretch = (0.3, 1.25) if truncated else (0.80, 1.25)
-        matches = scan(trace, interval, trains, limits, stretch)
+        matches = scan(trace, interval, trains, limits)
         found.append(_Scanned(trace, traces[0], band, interval, matches))
     if not found:
         return None
@@ -253,7 +251,6 @@ def find_passage(
     within: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
-    truncated: bool = False,
 ) -> Passage | None:
     """The train in an interval of time, from its rail channels (reference = first by score).
 
@@ -262,12 +259,11 @@ def find_passage(
         within: the event (s).
         trains: candidate types.
         limits: lowest and highest speed (m/s).
-        truncated: the record starts inside the train.
     """
     scanned = [
         found
         for record in records
-        if (found := _scan_channel(record, within, trains, limits, truncated)) is not None
+        if (found := _scan_channel(record, within, trains, limits)) is not None
     ]
     if not scanned:
         return None
@@ -455,16 +451,15 @@ def find_passages(
     within: tuple[float, float],
     catalogue: Catalogue,
     limits: tuple[float, float],
-    truncated: bool = False,
 ) -> list[Passage]:
     """Every train in an event, in order of time: at the longest pauses, two are tried for one."""
     rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
     if not rails:
         return []
-    whole = find_passage(rails, within, catalogue.types, limits, truncated)
+    whole = find_passage(rails, within, catalogue.types, limits)
     if whole is None:
         return []
-    return _divided(rails, within, whole, catalogue, limits, truncated, depth=3)
+    return _divided(rails, within, whole, catalogue, limits, depth=3)
 
 
 def _divided(
@@ -473,7 +468,6 @@ def _divided(
     whole: Passage,
     catalogue: Catalogue,
     limits: tuple[float, float],
-    truncated: bool,
     depth: int,
 ) -> list[Passage]:
     trace = whole.traces[0]
@@ -484,15 +478,15 @@ def _divided(
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
         parts = []
-        for half, cut in zip(halves, (truncated, False), strict=True):
-            part = find_passage(rails, half, catalogue.types, limits, cut)
+        for half in halves:
+            part = find_passage(rails, half, catalogue.types, limits)
             if part is None or not part.confirmed:
                 break
             parts.append(part)
         if len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1:
             return [
                 found
-                for half, part, cut in zip(halves, parts, (truncated, False), strict=True)
-                for found in _divided(rails, half, part, catalogue, limits, cut, depth - 1)
+                for half, part in zip(halves, parts, strict=True)
+                for found in _divided(rails, half, part, catalogue, limits, depth - 1)
             ]
     return [whole]

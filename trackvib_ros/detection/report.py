@@ -12,7 +12,7 @@ from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
 from .evidence import half_interval
 from .health import clipped
-from .live import Provisional
+from .live import Partial
 from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage, Record
 
 Array = NDArray[np.float64]
@@ -37,22 +37,85 @@ def arrival(channel: Channel, stamp_ns: int, ratio: float) -> TrainEvent:
     )
 
 
-def update(found: Provisional, now_ns: int) -> TrainEvent:
+def update(found: Partial, now_ns: int) -> TrainEvent:
     """A provisional speed while the train passes."""
+    values: dict[str, Value] = {
+        "speed": Estimate(found.speed, found.sigma, "m/s"),
+        "direction": _DIRECTION[found.direction],
+        "passed": Estimate(found.distance, 2.0, "m"),
+    }
+    if found.types:
+        values |= {
+            "passed": Estimate(found.distance, found.distance * found.sigma / found.speed, "m"),
+            "families": found.families,
+            "types": found.types,
+        }
     return TrainEvent(
         kind="update",
         stamp_ns=now_ns,
         sigma_s=0.0,
-        confidence=float(np.clip(found.correlation, 0.0, 0.95)),
-        method="delay of the envelope between two rail channels",
+        confidence=float(np.clip(found.score, 0.0, 0.95)),
+        method=found.method,
         sensors=found.sensors,
-        values={
-            "speed": Estimate(found.speed, found.sigma, "m/s"),
-            "direction": _DIRECTION[found.direction],
-            "passed": Estimate(found.distance, 2.0, "m"),
-        },
+        values=values,
         quality=("provisional",),
     )
+
+
+def truncated(catalogue: Catalogue, found: Partial, origin_ns: int) -> list[TrainEvent]:
+    """Departure and summary of a train in which the record begins: no arrival, no count, no type.
+
+    Args:
+        catalogue: for its version and its longest train.
+        found: the part on record, with its end.
+        origin_ns: start of the record.
+    """
+    assert found.end is not None
+    end_ns, end_sigma = origin_ns + round(found.end[0] * 1e9), found.end[1]
+    longest = max(train.span for train in catalogue)
+    confidence = float(np.clip(found.score, 0.0, 0.95))
+    place = Estimate(found.x, 0.0, "m")
+    part = found.distance * found.sigma / found.speed
+    return [
+        TrainEvent(
+            kind="departure",
+            stamp_ns=end_ns,
+            sigma_s=end_sigma,
+            confidence=confidence,
+            method=found.method,
+            sensors=found.sensors,
+            values={"grade": CONFIRMED, "reference_x": place},
+            quality=("truncated_start",),
+        ),
+        TrainEvent(
+            kind="passage",
+            stamp_ns=origin_ns,
+            # the train may have begun to pass as long before as the longest one takes
+            sigma_s=max(longest - found.distance, 0.0) / found.speed + end_sigma,
+            confidence=confidence,
+            method=f"{found.method}; stamped with the start of the record, arrival unknown",
+            sensors=found.sensors,
+            values={
+                "grade": CONFIRMED,
+                "reference": found.sensors[0],
+                "reference_x": place,
+                "departure_ns": end_ns,
+                "departure_sigma": end_sigma,
+                "speed": Estimate(found.speed, found.sigma, "m/s"),
+                "speed_at": "middle of the part on record at the reference point",
+                "direction": _DIRECTION[found.direction],
+                "type": "unknown",
+                "types_of_the_end": found.types,
+                "families": found.families,
+                "cars": "unknown",
+                "units": "unknown",
+                "on_record": Estimate(found.distance, part, "m"),
+                "score": round(found.score, 4),
+                "catalogue": catalogue.version,
+            },
+            quality=("truncated_start",),
+        ),
+    ]
 
 
 def closing(
@@ -61,35 +124,38 @@ def closing(
     origin_ns: int,
     within: tuple[float, float],
     found: Sequence[Passage],
-    flags: Sequence[str],
 ) -> list[TrainEvent]:
     """The events at the end of an event: per train its wheelsets, departure and summary."""
     events: list[TrainEvent] = []
     trains = [passage for passage in found if passage.confirmed]
     if not trains:
-        names = tuple(r.channel.name for r in records)
-        return [
-            TrainEvent(
-                kind="departure",
-                stamp_ns=origin_ns + round((within[1] - 0.3) * 1e9),
-                sigma_s=0.1,
-                confidence=0.5,
-                method="energy back at noise floor",
-                sensors=names,
-                values={
-                    "grade": VIBRATION,
-                    "score": max((p.score for p in found), default=0.0),
-                },
-                quality=(*flags, "low_score"),
-            )
-        ]
+        score = max((p.score for p in found), default=0.0)
+        return unclear(records, origin_ns + round((within[1] - 0.3) * 1e9), (), score)
     for passage in trains:
-        quality = [*flags, *passage.quality, *_window_flags(records, passage)]
+        quality = [*passage.quality, *_window_flags(records, passage)]
         if passage.blind is not None and _prefer_blind(passage, passage.blind):
             events += _unknown(catalogue, origin_ns, passage, passage.blind, quality)
         else:
             events += _train(catalogue, origin_ns, passage, quality)
     return events
+
+
+def unclear(
+    records: Sequence[Record], last_ns: int, flags: Sequence[str], score: float = 0.0
+) -> list[TrainEvent]:
+    """End of a vibration that no train explains, with the score of the best pattern."""
+    return [
+        TrainEvent(
+            kind="departure",
+            stamp_ns=last_ns,
+            sigma_s=0.1,
+            confidence=0.5,
+            method="energy back at noise floor",
+            sensors=tuple(r.channel.name for r in records),
+            values={"grade": VIBRATION, "score": score},
+            quality=(*flags, "low_score"),
+        )
+    ]
 
 
 def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
