@@ -34,7 +34,7 @@ from .segments import line_run
 from .traffic import Running, Traffic
 from .waves import Real, pinned_pinned_frequency, rail_frequency
 
-MARGIN = 1.25
+MARGIN = 1.15
 """Least crossover per pinned-pinned frequency: that resonance is deterministic."""
 
 LEAST_MARGIN = 1.1
@@ -46,9 +46,9 @@ wheel force in the last third octave below it is 1 dB too large."""
 NEWMARK_PHASE = 0.346
 """omega h at the crossover: Newmark's average acceleration lengthens periods there by 1 %."""
 
-SAMPLES = 7.0
-"""Steps of the global set per period of the crossover, at least. Forces then differ from those of
-steps four times shorter by 1 % of their rms about the mean, by 3 % in the last third octave."""
+SAMPLES = 5.9
+"""Steps of the global set per period of the crossover, at least. Forces then differ from ``fe`` by
+2 % of their rms about the mean, by 5 % in the last third octave below the crossover."""
 
 SPEED_RANGE = 2 ** (1 / 6)
 """Largest ratio of the speeds of a train on the line: a sixth octave."""
@@ -62,13 +62,13 @@ AHEAD = 0.1
 HALF_TAPS = 4
 """Samples of the global set on either side that make a sample in between.
 
-The global set ends at 1.15 f_g, its images start at 1/step - 1.15 f_g; with at least 6 samples
+The global set ends at 1.15 f_g, its images start at 1/step - 1.15 f_g; with almost 6 samples
 per period of f_g a Kaiser window of beta 8 leaves -80 dB of them.
 """
 
 
 def crossover_frequency(scenario: Scenario) -> float:
-    """f_g (Hz): as stated, or the first third-octave edge above 1.25 pinned-pinned frequencies.
+    """f_g (Hz): as stated, or the first third-octave edge above 1.15 pinned-pinned frequencies.
 
     With ``solution.sines`` given it is what these resolve on the rail, as in the paper, even where
     the pinned-pinned resonance then is left to the local set.
