@@ -43,8 +43,8 @@ def test_crossover_keeps_the_pinned_pinned_resonance_global() -> None:
     assert 1.15 * pinned <= chosen < 1.15 * pinned * 10**0.1
     with pytest.raises(InputError, match=r"solution\.crossover = 900 Hz.*954 Hz"):
         crossover_frequency(scenario(solution={"crossover": 900.0}))
-    with pytest.raises(InputError, match=r"leaves no local band.*frequency_limit = 1500 Hz"):
-        crossover_frequency(scenario(solution={"frequency_limit": 1500.0}))
+    with pytest.raises(InputError, match=r"leaves no local band.*frequency_limit = 1200 Hz"):
+        crossover_frequency(scenario(solution={"frequency_limit": 1200.0}))
 
 
 def test_stated_sines_set_the_crossover() -> None:
