@@ -61,9 +61,12 @@ def test_energy_of_a_passage_balances():
     assert dissipated > 0.1 * work > 0
 
 
-@pytest.mark.parametrize("model", ["fe", "hybrid"])
-def test_a_run_balances_the_energy_of_its_line(model):
+@pytest.mark.parametrize(("model", "tolerance"), [("fe", 1e-3), ("hybrid", 5e-3)])
+def test_a_run_balances_the_energy_of_its_line(model, tolerance):
     """Work of the wheels = loss + change of energy for the damping as it is: 0.1 %.
+
+    Trapezoidal sums of power with 6 steps a period, as the hybrid has them at its crossover, err
+    by (2 pi/6)^2/12 = 9 % of what comes from there, a few per cent of all power: 0.5 %.
 
     The motion is put together from the complex modes and weighed with M, C and K, so the balance
     fails if stepping, normalisation or truncation is wrong.
@@ -77,9 +80,9 @@ def test_a_run_balances_the_energy_of_its_line(model):
     run = simulation._run if model == "fe" else simulation._run._run
     work, lost, change = run._balance.totals()
     assert lost > 0.1 * abs(change)
-    assert simulation.quality.energy_residual < 1e-3
+    assert simulation.quality.energy_residual < tolerance
     # the same without a tenth of the loss does not close
-    assert abs(work - 0.9 * lost - change) > 5e-3 * max(abs(work), abs(change))
+    assert abs(work - 0.9 * lost - change) > 2 * tolerance * max(abs(work), abs(change))
 
 
 @pytest.mark.parametrize("law", ["linear", "hertz"])
