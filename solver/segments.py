@@ -46,6 +46,8 @@ from .modal import (
     SLOW,
     Fleet,
     ModalRun,
+    _cubic,
+    _feed,
     _step_unit,
     aligned,
     exponential_weights,
@@ -527,20 +529,6 @@ def _react(cubics, cell, s, i, react):  # type: ignore[no-untyped-def]
                 cubics[cell, 1, row, j]
                 + s * (cubics[cell, 2, row, j] + s * cubics[cell, 3, row, j])
             )
-
-
-@njit(**KERNEL)
-def _cubic(c, cell, row, s):  # type: ignore[no-untyped-def]
-    return c[cell, row, 0] + s * (c[cell, row, 1] + s * (c[cell, row, 2] + s * c[cell, row, 3]))
-
-
-@njit(**KERNEL)
-def _feed(c, cell, row, s, force, outputs, n):  # type: ignore[no-untyped-def]
-    for o in range(outputs.shape[1]):
-        outputs[n, o] += force * (
-            c[cell, row, 0, o]
-            + s * (c[cell, row, 1, o] + s * (c[cell, row, 2, o] + s * c[cell, row, 3, o]))
-        )
 
 
 @njit(**KERNEL)

@@ -24,6 +24,18 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
+def _pad_points(spacing: float, length: float) -> list[tuple[float, float]]:
+    """Places (m) in a bay and weights of the points at which a pad of some length (m) acts."""
+    middle = spacing / 2
+    if length == 0:
+        return [(middle, 1.0)]
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    return [
+        (middle + length / 2 * float(node), float(weight) / 2)
+        for node, weight in zip(nodes, weights, strict=True)
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class WaveBeam:
     """An infinite uniform beam, on a uniform elastic support if that is given.
@@ -235,16 +247,6 @@ class PeriodicRail:
             return pad
         return np.asarray(pad / (1 + pad * self.foundation.transfer_receptance(w, 0.0)))
 
-    def _supports(self) -> list[tuple[float, float]]:
-        middle = self.spacing / 2
-        if self.pad_length == 0:
-            return [(middle, 1.0)]
-        nodes, weights = np.polynomial.legendre.leggauss(4)
-        return [
-            (middle + self.pad_length / 2 * float(node), float(weight) / 2)
-            for node, weight in zip(nodes, weights, strict=True)
-        ]
-
     def _carry(self, omega: Real, length: float) -> Complex:
         """Transfer matrices of (w, theta, V, M) over a free length, shape (F, 4, 4)."""
         s = self.beam.exponents(omega)
@@ -268,7 +270,7 @@ class PeriodicRail:
         stiffness = self.support_stiffness(omega)
         total = np.broadcast_to(np.eye(4, dtype=np.complex128), (omega.size, 4, 4)).copy()
         place = 0.0
-        for support, share in self._supports():
+        for support, share in _pad_points(self.spacing, self.pad_length):
             if support > x:
                 break
             total = self._carry(omega, support - place) @ total
@@ -553,16 +555,6 @@ class LayeredTrack:
             Waves(single * np.repeat(layer, 2, axis=1), s),
         )
 
-    def _pads(self) -> list[tuple[float, float]]:
-        middle = self.spacing / 2
-        if self.pad_length == 0:
-            return [(middle, 1.0)]
-        nodes, weights = np.polynomial.legendre.leggauss(4)
-        return [
-            (middle + self.pad_length / 2 * float(node), float(weight) / 2)
-            for node, weight in zip(nodes, weights, strict=True)
-        ]
-
     def solve(self, omega: Real, ring: int = 512) -> LayeredSolution:
         """The track at frequencies (rad/s), repeating after ``ring`` bays."""
         return LayeredSolution(self, np.asarray(omega, dtype=np.float64), ring)
@@ -582,7 +574,7 @@ class LayeredSolution:
         self._period = np.exp(2j * np.pi * (np.arange(ring) + 0.5) / ring)
         self._rail = track.rail_waves(omega)
         self._slab, self._layer = track.plate_waves(omega)
-        self._pads = track._pads()
+        self._pads = _pad_points(track.spacing, track.pad_length)
         self._combs: dict[float, Complex] = {}
         pad = track.stiffness + 1j * omega * track.damping
         count = len(self._pads)
