@@ -611,12 +611,16 @@ def _score_safely(
     view = ""
     try:
         recording = read_bag(path)
-        for view in views(recording.factors) if callable(views) else views:
+        asked = views(recording.factors) if callable(views) else views
+        for view in asked:
             score = score_recording(recording, str(path), view, detector)
             if score is not None:
                 scores.append(score)
-        if not scores:
-            raise InputError(f"no channel for the views asked for: {views}")
+        if asked and not scores:
+            have = ", ".join(channel.name for channel in recording.channels)
+            raise InputError(
+                f"no channel for the views asked for ({', '.join(asked)}); the bag has {have}"
+            )
     except Exception as failure:  # a plug-in may raise anything; the other bags still count
         problem = f"{type(failure).__name__}: {failure}"
         scores.append(BagScore(str(path), view, {}, 0.0, 0.0, problem=problem))

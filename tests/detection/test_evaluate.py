@@ -489,6 +489,9 @@ def test_dataset_is_resumed_scored_and_made_again(tmp_path):
 
     naive = evaluate([bag], "tests.detection.naive:PeakCounter")
     assert not naive.bags[0].problem
+    assert not evaluate([bag], views=lambda factors: []).bags
+    (unheard,) = evaluate([bag], views=["slab, type known"]).bags
+    assert "(slab, type known); the bag has rail" in unheard.problem
 
     again = tmp_path / "again" / name
     main = "from trackvib_ros.cli import main; main()"
