@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from .kinematics import HIGH_BAND_POSITION_SIGMA, POSITION_SIGMA, Fit, Motion, regress
+from .kinematics import Fit, Motion, regress
 from .pattern import Trace
+from .place import Wave, likelihood, locate
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,8 @@ _FREE_POSITION = 0.3  # m, of a channel while only spacings are compared
 _MIRROR = 1.6  # m either side of an axis of symmetry that are compared
 _MIRROR_SIGMAS = 8.0  # largest minus least of some thirty noisy cells is 4 to 5 sigma
 _MIRROR_RISE = 0.7  # ln, 3 dB: flatter levels have no axis
+_PLACE_LOW = 0.07  # m, scale of the error of the axis in the lowest band (half within 0.05 m, ...
+_PLACE_HIGH = 0.21  # m, ... one in twenty beyond 0.35 m) and in higher ones (0.17 m, 0.9 m)
 _COVERED = 0.6  # part of a wheelset's window that must have been measured
 
 
@@ -179,6 +182,7 @@ def fit_axles(
     places: Sequence[Array],
     start: Motion,
     anchors: Sequence[Trace],
+    waves: Sequence[Wave],
 ) -> AxleFit:
     """Times of the wheelsets of a train at every rail channel, and its motion.
 
@@ -187,6 +191,7 @@ def fit_axles(
         places: per trace, distance s (m) at which each wheelset passes it.
         start: rough motion, good to about 1 m everywhere.
         anchors: the same channels in their lowest band, where the rail bends under the wheel.
+        waves: their low-passed waveforms.
     """
     motion = start
     count = places[0].size
@@ -240,17 +245,26 @@ def fit_axles(
         if motion.speed < 1.0:
             fit = None
             break
-    place_sigma = np.full(len(traces), HIGH_BAND_POSITION_SIGMA)
+    place_sigma = np.full(len(traces), np.inf)
     residual = np.zeros(shape)
     if fit is not None:
+        scales = np.full(len(traces), _PLACE_HIGH)
+        due = motion.time_at(np.stack(list(places)))
+        pace = np.maximum(motion.speed_at(due), 0.5)
+        tables = []
         for k, trace in enumerate(anchors):
             found = _centre(trace, motion, places[k], classes, 1.0)
             if found is None or found[1] < _MIRROR_RISE:
                 found = _centre(traces[k], motion, places[k], classes, reach)
             else:
-                place_sigma[k] = POSITION_SIGMA
+                scales[k] = _PLACE_LOW
             if found is not None:
-                time[k] += found[0] / np.maximum(motion.speed_at(motion.time_at(places[k])), 0.5)
+                time[k] += found[0] / pace[k]
+            seen = observed[k] if observed[k].any() else slice(None)
+            late = float(np.median(((time[k] - due[k]) * pace[k])[seen]))
+            tables.append(likelihood(waves[k], motion, places[k] + late))
+        more, place_sigma = locate(tables, scales)
+        time += more[:, None] / pace
         fit = regress(time[observed], np.stack(list(places))[observed], channel, motion.epoch)
         residual[observed] = fit.residual
     return AxleFit(

@@ -16,6 +16,7 @@ from .evidence import Candidate, Explanation, explain
 from .features import Window
 from .kinematics import Motion, robust_scale
 from .pattern import Match, Trace, refine, scan
+from .place import Wave
 
 Array = NDArray[np.float64]
 
@@ -198,6 +199,7 @@ def quiet_gaps(
 class _Scanned:
     trace: Trace
     low: Trace
+    wave: Wave
     band: tuple[float, float]
     interval: tuple[float, float]
     matches: list[Match]
@@ -215,12 +217,14 @@ def _scan_channel(
 ) -> _Scanned | None:
     found = []
     traces = traces_of(record, within)
-    for trace, band in zip(traces, record.window.bands, strict=True):
+    window = record.window
+    wave = Wave(window.time - window.low_shift, window.low, window.valid)
+    for trace, band in zip(traces, window.bands, strict=True):
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
         matches = scan(trace, interval, trains, limits)
-        found.append(_Scanned(trace, traces[0], band, interval, matches))
+        found.append(_Scanned(trace, traces[0], wave, band, interval, matches))
     if not found:
         return None
     top = max(s.score for s in found)
@@ -342,6 +346,7 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
             [places + delay * match.speed for _, delay in kept],
             _recentred(match),
             [s.low for s, _ in kept],
+            [s.wave for s, _ in kept],
         )
         if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
             continue
