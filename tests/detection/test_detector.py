@@ -147,7 +147,8 @@ def test_gaps_between_blocks_are_dropouts():
     assert passage.values["axle_count"] == 32
     # drop-outs spoil windows: CRH3 and CRH2, 0.9 % apart in size, may then not be told apart
     speed = passage.values["speed"]
-    assert abs(speed.value - 60.0) < 2 * speed.sigma < 2 * 60.0 * 0.009
+    # (bursts without a deflection); the interval ends within the spread of the other type's speed
+    assert abs(speed.value - 60.0) < 2.2 * speed.sigma < 2.2 * 60.0 * 0.009
     assert "gaps" in passage.quality
 
 

@@ -12,7 +12,9 @@ CATALOGUE = Catalogue.default()
 SPEED, BASELINE, NOISE = 60.0, 20.0, 0.02
 
 
-def candidate(nominal, true, offsets=(0.0, 0.0), channels=2, seed=0, noise=NOISE):
+def candidate(
+    nominal, true, offsets=(0.0, 0.0), channels=2, seed=0, noise=NOISE, place=0.1, site=0.0
+):
     """A type of ``nominal`` places fitted to the times of a train of ``true`` ones."""
     rng = np.random.default_rng(seed)
     shifts = BASELINE * np.arange(channels)
@@ -23,14 +25,16 @@ def candidate(nominal, true, offsets=(0.0, 0.0), channels=2, seed=0, noise=NOISE
     # the second channel is aligned where its pattern was seen, as in a passage
     scale = nominal[-1] / true[-1]
     seen_shift = scale * SPEED * (time[:, 0] - time[0, 0])
-    place = (nominal[None, :] + seen_shift[:, None])[seen]
-    fit = regress(time[seen], place, channel, float(time.mean()))
+    seen_place = (nominal[None, :] + seen_shift[:, None])[seen]
+    fit = regress(time[seen], seen_place, channel, float(time.mean()))
     zeros = np.zeros(time.shape)
     residual = zeros.copy()
     residual[seen] = fit.residual
-    sigma = np.full(channels, 0.1)
+    sigma = np.full(channels, place)
     axle_fit = AxleFit(fit.motion, fit.scale, time, residual, zeros, seen, fit.offset, sigma)
-    return Candidate(nominal, shifts, axle_fit, 0.9)
+    free = site**2 * (np.eye(channels) + 1.0)
+    free[0] = free[:, 0] = 0.0
+    return Candidate(nominal, shifts, axle_fit, 0.9, free)
 
 
 def test_a_listed_train_is_its_type():
@@ -87,3 +91,25 @@ def test_interval_of_a_mixture():
     near, far = (0.96, 0.0, 1e-6), (0.04, 1.0, 1e-6)
     assert half_interval([near, far], 0.0) < 1e-4
     assert half_interval([(0.8, 0.0, 1e-6), (0.2, 1.0, 1e-6)], 0.0) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("place", "channels"), [(0.02, 2), (0.02, 1), (0.1, 2)])
+def test_types_of_one_shape_are_told_by_the_distance_between_channels(place, channels):
+    own = CATALOGUE["CRH3"].axles
+    twin = 1.009 * own  # CRH2 but for 3 cm in its bogie centres
+    odds = []
+    for seed in range(10):
+        common = {"channels": channels, "seed": seed, "place": place}
+        found = explain([candidate(twin, own, **common), candidate(own, own, **common)])
+        types = {e.candidate: e.probability for e in found if e.kind == "type"}
+        odds.append(np.log(types[1] / types[0]))
+    # the distance would be 0.009 x 20 m off, and is known to 2**0.5 x place
+    expected = 0.5 * (0.009 * BASELINE) ** 2 / (2 * place**2) if channels == 2 else 0.0
+    assert np.mean(odds) == pytest.approx(expected, rel=0.15, abs=0.4)
+
+
+def test_an_uncertain_distance_between_channels_widens_the_speed_of_an_unlisted_train():
+    axles = CATALOGUE["CRH3"].axles
+    best = explain([candidate(axles, 0.94 * axles, place=0.02, site=0.05)])[0]
+    sigma = best.motion.speed_sigma(best.motion.epoch)
+    assert sigma / SPEED == pytest.approx(2**0.5 * np.hypot(0.02, 0.05) / BASELINE, rel=0.15)

@@ -9,6 +9,7 @@ Five lines from arrays::
     print(passages[0].values["speed"], passages[0].values["type"])
 """
 
+from .calibration import Calibration
 from .catalogue import Catalogue, TrainType
 from .detector import DetectorConfig, TrainDetector, detect
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent
@@ -16,6 +17,7 @@ from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent
 __all__ = [
     "CONFIRMED",
     "VIBRATION",
+    "Calibration",
     "Catalogue",
     "Channel",
     "DetectorConfig",

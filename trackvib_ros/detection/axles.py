@@ -8,7 +8,7 @@ distributed): L = -sum(ln m + e/m), m = amplitude * pulse(u - shift) + floor. No
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +175,24 @@ def _centre(
         bend = left - 2 * here + right
         fraction = 0.5 * (left - right) / bend if bend > 0 else 0.0
     return float((top - steps + fraction) * _STEP), rise
+
+
+def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
+    """The wheelset times of one type under another of the same number of wheelsets.
+
+    Args:
+        fit: to the first type.
+        places: per trace, as for :func:`fit_axles`.
+    """
+    seen = fit.observed
+    again = regress(
+        fit.time[seen], np.stack(list(places))[seen], np.nonzero(seen)[0], fit.motion.epoch
+    )
+    residual = np.zeros(seen.shape)
+    residual[seen] = again.residual
+    return replace(
+        fit, motion=again.motion, scale=again.scale, residual=residual, offset=again.offset
+    )
 
 
 def fit_axles(

@@ -20,8 +20,20 @@ from solver import InputError
 
 Array = NDArray[np.float64]
 
+POSITION_SIGMA = 0.02
+"""Standard uncertainty (m) of the stated position of a channel: measured along the rail by tape."""
+
 _MEMORY = 300.0  # passages after which what was learned has faded to what was stated
 _GATE = 4.0  # standard deviations: more is another train than was thought, or a moved sensor
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Effective minus stated places of channels, less that of the first (m); covariance (m²)."""
+
+    channels: tuple[str, ...]
+    offset: Array
+    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class Calibration:
     passages: int = 0
 
     @classmethod
-    def untaught(cls, channels: Sequence[str], stated: float) -> Calibration:
+    def untaught(cls, channels: Sequence[str], stated: float = POSITION_SIGMA) -> Calibration:
         """The positions as stated, with a standard uncertainty (m)."""
         n = len(channels)
         return cls(tuple(channels), np.zeros(n), stated**2 * np.eye(n), stated)
@@ -54,21 +66,12 @@ class Calibration:
         rows = self._differences(names)
         return rows @ self.offset, rows @ self.covariance @ rows.T
 
-    def learned(self, names: Sequence[str], measured: Array, variance: Array) -> Calibration:
-        """What a passage adds.
-
-        Args:
-            names: of the channels that were measured.
-            measured: relative to the first of them, as in :meth:`relative`, shape (channels,).
-            variance: covariance of these (m²).
-
-        Returns:
-            The same if the passage contradicts by more than four standard deviations.
-        """
-        rows = self._differences(names)[1:]
+    def learned(self, found: Measured) -> Calibration:
+        """What a passage adds; nothing if it contradicts by more than four standard deviations."""
+        rows = self._differences(found.channels)[1:]
         prior = self.covariance + 2 * self.stated**2 / _MEMORY * np.eye(len(self.channels))
-        surprise = measured[1:] - rows @ self.offset
-        expected = rows @ prior @ rows.T + variance[1:, 1:]
+        surprise = found.offset[1:] - rows @ self.offset
+        expected = rows @ prior @ rows.T + found.covariance[1:, 1:]
         if np.any(np.abs(surprise) > _GATE * np.sqrt(np.diag(expected))):
             return self
         gain = prior @ rows.T @ np.linalg.inv(expected)

@@ -14,6 +14,7 @@ from solver import InputError
 from trackvib_ros.waveform import Waveform
 
 from . import report
+from .calibration import POSITION_SIGMA, Calibration
 from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .features import FRAME, GroupStream
@@ -58,6 +59,7 @@ class DetectorConfig:
             bogies of a car at ``min_speed``. A train whose bogies follow faster ends sooner.
         max_event: an event longer than this is a changed noise level, not a train (s).
         max_lag: a group this far behind the others is taken for silent (s).
+        position_sigma: standard uncertainty of the channels' positions (m).
     """
 
     min_speed: float = 10.0
@@ -65,6 +67,7 @@ class DetectorConfig:
     hang: float = 1.8
     max_event: float = 90.0
     max_lag: float = 1.0
+    position_sigma: float = POSITION_SIGMA
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -77,6 +80,10 @@ class DetectorConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"{name} = {value} s must lie from {low} to {high} s")
+        if not 1e-4 <= self.position_sigma <= 5:
+            raise InputError(
+                f"position_sigma = {self.position_sigma} m must lie from 0.0001 to 5 m"
+            )
 
 
 class _Group:
@@ -112,9 +119,13 @@ class TrainDetector:
         channels: accelerometers, with positions.
         catalogue: train types; the shipped one by default.
         config: settings.
+        calibration: what earlier passages have taught, :attr:`calibration` of another detector.
+
+    Attributes:
+        calibration: where the channels are, as learned from the passages so far.
 
     Raises:
-        InputError: no channel, or a name twice.
+        InputError: no channel, a name twice, or a calibration of other channels.
     """
 
     def __init__(
@@ -122,6 +133,7 @@ class TrainDetector:
         channels: Sequence[Channel],
         catalogue: Catalogue | None = None,
         config: DetectorConfig | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         self.channels = tuple(channels)
         self.catalogue = catalogue or Catalogue.default()
@@ -131,12 +143,19 @@ class TrainDetector:
             raise InputError("the detector has no channel; give at least one Channel")
         if len(set(names)) != len(names):
             raise InputError(f"channel names must differ, not {', '.join(names)}")
+        if calibration is not None and set(calibration.channels) != set(names):
+            raise InputError(
+                f"calibration is of channels {', '.join(calibration.channels)}, the detector has "
+                f"{', '.join(names)}; give one that was learned with these"
+            )
+        self._given = calibration or Calibration.untaught(names, self.config.position_sigma)
         self._index = {name: i for i, name in enumerate(names)}
         self._limits = (self.config.min_speed, self.config.max_speed)
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, noise floors included: the clock jumped back."""
+        """Forget everything since the start, noise floors included: the clock jumped back."""
+        self.calibration = self._given
         self._groups: dict[tuple[str, ...], _Group] = {}
         self._start_ns: int | None = None
         self._done_ns = 0
@@ -345,13 +364,19 @@ class TrainDetector:
             part = self._truncated(last, now_ns)
             if part is not None:
                 return part
-        found = find_passages(records, within, self.catalogue, self._limits)
+        found = self._find(records, within)
         if records and not any(passage.confirmed for passage in found):
             found, swapped = self._try_swapped(records, within, found)
         else:
             swapped = []
+        for passage in found:
+            if passage.confirmed and passage.known and passage.measured is not None and not swapped:
+                self.calibration = self.calibration.learned(passage.measured)
         events = self._passage_health(now_ns, records, within, found, swapped)
         return events + report.closing(self.catalogue, records, origin, within, found)
+
+    def _find(self, records: list[Record], within: tuple[float, float]) -> list[Passage]:
+        return find_passages(records, within, self.catalogue, self._limits, self.calibration)
 
     def _records(self, from_ns: int, to_ns: int) -> list[Record]:
         records = []
@@ -427,7 +452,7 @@ class TrainDetector:
             for r in records
             if r.channel.layer != "rail"
         ]
-        instead = find_passages(others, within, self.catalogue, self._limits) if others else []
+        instead = self._find(others, within) if others else []
         sure = [p for p in instead if p.known]
         return (sure, [trace.name for trace in sure[0].traces]) if sure else (found, [])
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .axles import AxleFit, fit_axles
+from .axles import AxleFit, fit_axles, refit
 from .blind import Blind, describe
+from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
 from .events import Channel
 from .evidence import Candidate, Explanation, explain
@@ -38,6 +39,13 @@ CONFIRM_CORRELATION = 0.6
 
 HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
+
+_CERTAIN = 0.99
+"""Probability of a type, by its pattern alone, that teaches where the channels are."""
+
+_TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
+
+_UNSTATED = 0.5  # m, distance between channels of no use
 
 _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
 _STRETCH = (
@@ -87,6 +95,9 @@ class Passage:
         explanations: types, relatives of them and wrong clocks, most probable first.
         clock_offset: (channel, offset s, sigma s) for channels whose clock contradicts the motion.
         delay: speed by the delays between two channels (m/s), sigma; or None.
+        measured: where the channels are, if the pattern alone tells the type.
+        baseline: learned correction of the distance between the outer two channels that was
+            used (m), sigma, passages it was learned from; or None.
     """
 
     interval: tuple[float, float]
@@ -97,6 +108,8 @@ class Passage:
     explanations: tuple[Explanation, ...] = ()
     clock_offset: tuple[tuple[str, float, float], ...] = ()
     delay: tuple[float, float] | None = None
+    measured: Measured | None = None
+    baseline: tuple[float, float, int] | None = None
     quality: tuple[str, ...] = ()
     coarse_score: float = 0.0
     blind: Blind | None = None
@@ -255,6 +268,7 @@ def find_passage(
     within: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
+    site: Calibration,
 ) -> Passage | None:
     """The train in an interval of time, from its rail channels (reference = first by score).
 
@@ -263,6 +277,7 @@ def find_passage(
         within: the event (s).
         trains: candidate types.
         limits: lowest and highest speed (m/s).
+        site: where the channels are.
     """
     scanned = [
         found
@@ -282,7 +297,7 @@ def find_passage(
         traces = tuple(s.trace for s in scanned)
         passage = Passage(interval, traces, reference.band, (), 0, coarse_score=reference.score)
     else:
-        passage = _fit_hypotheses(usable, reference)
+        passage = _fit_hypotheses(usable, reference, site)
     if passage.known:
         return passage
     guess = None
@@ -325,7 +340,7 @@ def _delays(
     return (votes[0] if votes else 0), kept, offsets
 
 
-def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
+def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned, site: Calibration) -> Passage:
     best = reference.matches[0]
     direction, kept, offsets = _delays(usable, best)
     table: dict[tuple[str, bool], list[float]] = {}
@@ -333,25 +348,31 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
         for match in s.matches:
             table.setdefault((match.train.name, match.reverse), []).append(match.score)
     trains: list[Hypothesis] = []
-    candidates: list[Candidate] = []
-    shifts = np.array([(direction or 1) * (s.trace.x - reference.trace.x) for s, _ in kept])
+    aligned: list[list[Array]] = []
+    names = tuple(s.trace.name for s, _ in kept)
+    stated = np.array([s.trace.x - reference.trace.x for s, _ in kept])
+    offset, covariance = site.relative(names)
+    shifts = (direction or 1) * (stated + offset)
     for match in reference.matches:
         score = sum(table[match.train.name, match.reverse]) / len(kept)
         if score < best.score - 0.25:
             continue
         places = match.train.oriented(match.reverse)
+        aligned.append([places + delay * match.speed for _, delay in kept])
         fit = fit_axles(
             [s.trace for s, _ in kept],
             # where the pattern was seen; whether the distance agrees is for the evidence to say
-            [places + delay * match.speed for _, delay in kept],
+            aligned[-1],
             _recentred(match),
             [s.low for s, _ in kept],
             [s.wave for s, _ in kept],
         )
         if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
+            aligned.pop()
             continue
         trains.append(Hypothesis(match.train, match.reverse, direction, score, fit))
-        candidates.append(Candidate(places, shifts, fit, score))
+    trains = _same_times(trains, aligned)
+    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance) for h in trains]
     explanations = explain(candidates)
     if explanations and explanations[0].kind == "clock":
         wrong = kept[explanations[0].channel][0]
@@ -361,7 +382,7 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
             candidates[explanations[0].candidate].places + shifts[k]
         )
         told = (wrong.trace.name, float(np.median(late)), 0.2 / motion.speed)
-        passage = _fit_hypotheses([s for s in usable if s is not wrong], reference)
+        passage = _fit_hypotheses([s for s in usable if s is not wrong], reference, site)
         return replace(
             passage,
             clock_offset=(*passage.clock_offset, told),
@@ -379,8 +400,58 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned) -> Passage:
         quality=("unsynchronised",) if offsets else (),
     )
     if hypotheses and direction:
-        passage = replace(passage, delay=delay_speed(passage))
+        last = int(np.argmax(np.abs(stated)))
+        passage = replace(
+            passage,
+            delay=delay_speed(passage),
+            measured=_measure(candidates, names, direction * stated, direction),
+            baseline=(float(offset[last]), float(covariance[last, last] ** 0.5), site.passages),
+        )
     return passage
+
+
+def _same_times(
+    trains: Sequence[Hypothesis], aligned: Sequence[Sequence[Array]]
+) -> list[Hypothesis]:
+    """Types of one shape with the same wheelset times, those of the closest fit.
+
+    A pulse mistaken under one of them must not decide between types that differ by a per cent.
+    """
+    out = []
+    for own, places in zip(trains, aligned, strict=True):
+        twins = [h for h in trains if _one_shape(h.places, own.places)]
+        closest = min(twins, key=lambda h: h.fit.scale)
+        fit = own.fit if closest is own else refit(closest.fit, places)
+        out.append(replace(own, fit=fit))
+    return out
+
+
+def _one_shape(a: Array, b: Array) -> bool:
+    """Whether places (m) differ by no more than their size."""
+    if a.size != b.size:
+        return False
+    return float(np.max(np.abs(a * (a @ b) / (a @ a) - b))) < _TWIN
+
+
+def _measure(
+    candidates: Sequence[Candidate], names: tuple[str, ...], stated: Array, direction: int
+) -> Measured | None:
+    """Where the channels are, from a train that its pattern alone tells."""
+    free = _UNSTATED**2 * (np.eye(len(names)) + 1.0)
+    free[0] = free[:, 0] = 0.0
+    alone = [replace(c, shifts=stated, site=free) for c in candidates]
+    best = explain(alone)[0]
+    if best.kind != "type" or best.probability < _CERTAIN:
+        return None
+    fit = candidates[best.candidate].fit
+    if not fit.used.any(axis=1).all():
+        return None
+    ahead = best.motion.distance_at(fit.time) - candidates[best.candidate].places
+    shift = np.array([np.median(row[seen]) for row, seen in zip(ahead, fit.used, strict=True)])
+    variance = fit.place_sigma**2 + fit.scale**2 / fit.used.sum(axis=1)
+    covariance = np.diag(variance) + variance[0]
+    covariance[0] = covariance[:, 0] = 0.0
+    return Measured(names, direction * (shift - shift[0] - stated), covariance)
 
 
 def _with_probabilities(
@@ -456,15 +527,17 @@ def find_passages(
     within: tuple[float, float],
     catalogue: Catalogue,
     limits: tuple[float, float],
+    site: Calibration | None = None,
 ) -> list[Passage]:
     """Every train in an event, in order of time: at the longest pauses, two are tried for one."""
+    site = site or Calibration.untaught([r.channel.name for r in records])
     rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
     if not rails:
         return []
-    whole = find_passage(rails, within, catalogue.types, limits)
+    whole = find_passage(rails, within, catalogue.types, limits, site)
     if whole is None:
         return []
-    return _divided(rails, within, whole, catalogue, limits, depth=3)
+    return _divided(rails, within, whole, catalogue, limits, site, depth=3)
 
 
 def _divided(
@@ -473,6 +546,7 @@ def _divided(
     whole: Passage,
     catalogue: Catalogue,
     limits: tuple[float, float],
+    site: Calibration,
     depth: int,
 ) -> list[Passage]:
     trace = whole.traces[0]
@@ -484,7 +558,7 @@ def _divided(
         halves = ((within[0], middle), (middle, within[1]))
         parts = []
         for half in halves:
-            part = find_passage(rails, half, catalogue.types, limits)
+            part = find_passage(rails, half, catalogue.types, limits, site)
             if part is None or not part.confirmed:
                 break
             parts.append(part)
@@ -492,6 +566,6 @@ def _divided(
             return [
                 found
                 for half, part in zip(halves, parts, strict=True)
-                for found in _divided(rails, half, part, catalogue, limits, depth - 1)
+                for found in _divided(rails, half, part, catalogue, limits, site, depth - 1)
             ]
     return [whole]

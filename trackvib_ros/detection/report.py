@@ -334,6 +334,10 @@ def _train(
         values["axle_spacing_sigma"] = round(float(np.hypot(0.2, 2.5 * sigma / speed)), 3)
     if passage.delay is not None:
         values["speed_delay"] = Estimate(*passage.delay, "m/s")
+    if passage.baseline is not None:
+        correction, uncertainty, learned = passage.baseline
+        values["baseline_correction"] = Estimate(correction, uncertainty, "m")
+        values["baseline_passages"] = learned
     confidence = float(np.clip(best.score, 0.0, 0.99))
     events.append(
         TrainEvent(

@@ -1,0 +1,103 @@
+"""What passages teach of the distance between two rail channels."""
+
+import numpy as np
+import pytest
+
+from solver import InputError
+from trackvib_ros.detection import Calibration, Channel, DetectorConfig, TrainDetector
+from trackvib_ros.detection.calibration import Measured
+
+from .synthetic import CATALOGUE, RAILS, Passage, blocks, record
+
+NAMES = ("a", "b")
+
+
+def measured(value, sigma=0.03):
+    covariance = np.zeros((2, 2))
+    covariance[1, 1] = sigma**2
+    return Measured(NAMES, np.array([0.0, value]), covariance)
+
+
+def test_first_passage_is_a_weighted_mean():
+    found = Calibration.untaught(NAMES, 0.1).learned(measured(0.12, 0.05))
+    # weights of N(0, 2 x 0.1²), a little more for a passage's drift, and 0.12 +- 0.05
+    prior = 2 * 0.1**2 * (1 + 2 / 300)
+    offset, covariance = found.relative(NAMES)
+    assert offset[1] == pytest.approx(0.12 * prior / (prior + 0.05**2), rel=1e-12)
+    assert covariance[1, 1] == pytest.approx(1 / (1 / prior + 1 / 0.05**2), rel=1e-12)
+    assert found.relative(("b", "a"))[0][1] == pytest.approx(-offset[1])
+
+
+def test_stated_sigma_holds_while_learning():
+    rng = np.random.default_rng(0)
+    ratios = []
+    for _ in range(200):
+        true = 2**0.5 * 0.05 * rng.standard_normal()
+        state = Calibration.untaught(NAMES, 0.05)
+        for _ in range(5):
+            state = state.learned(measured(true + 0.03 * rng.standard_normal()))
+        offset, covariance = state.relative(NAMES)
+        ratios.append((offset[1] - true) / covariance[1, 1] ** 0.5)
+    # 200 draws: 1 +- 3 / sqrt(400)
+    assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.15
+
+
+def test_a_contradiction_teaches_nothing():
+    state = Calibration.untaught(NAMES, 0.02)
+    assert state.learned(measured(0.5)) is state
+
+
+def test_old_passages_fade():
+    state = Calibration.untaught(NAMES, 0.05)
+    for _ in range(50):
+        state = state.learned(measured(0.08))
+    assert state.relative(NAMES)[0][1] == pytest.approx(0.08, abs=0.005)
+    for _ in range(300):
+        state = state.learned(measured(-0.02))
+    assert state.relative(NAMES)[0][1] == pytest.approx(-0.02, abs=0.005)
+    assert state.relative(NAMES)[1][1, 1] > 0  # never certain
+
+
+def test_text_and_back():
+    state = Calibration.untaught(NAMES, 0.05).learned(measured(0.04))
+    again = Calibration.from_json(state.to_json())
+    assert again.to_json() == state.to_json()
+    with pytest.raises(InputError, match="offset_m"):
+        Calibration.from_json(state.to_json().replace('"offset_m"', '"offset"'))
+
+
+def metro(speed, seed):
+    return record([Passage(CATALOGUE["metro"].axles, speed)], RAILS, 30, seed, kind="pulse")
+
+
+def test_a_wrong_position_is_learned_and_then_allowed_for():
+    # stands at 20.0 m, is said to stand at 20.1 m
+    said = (RAILS[0], Channel(RAILS[1].name, 20.1))
+    detector = TrainDetector(said, config=DetectorConfig(position_sigma=0.1))
+    start_ns = 0
+    for seed, speed in enumerate((30.0, 45.0, 60.0)):
+        for block in blocks(metro(speed, seed), 0.5, start_ns):
+            detector.process(block)
+        start_ns += 20_000_000_000
+    detector.finish()
+    offset, covariance = detector.calibration.relative([c.name for c in said])
+    assert detector.calibration.passages == 3
+    assert abs(offset[1] + 0.1) < 2.5 * covariance[1, 1] ** 0.5 < 2.5 * 0.03
+
+    later = TrainDetector(said, calibration=detector.calibration)
+    crh3 = record([Passage(CATALOGUE["CRH3"].axles, 50.0)], RAILS, 30, 9, kind="pulse")
+    events = [e for block in blocks(crh3, 0.5) for e in later.process(block)] + later.finish()
+    (passage,) = [e for e in events if e.kind == "passage"]
+    # half of the 0.18 m by which CRH2 would differ was in the position
+    assert passage.values["type"] == "CRH3"
+    assert passage.values["baseline_passages"] == 3
+    assert passage.values["baseline_correction"].value == offset[1]
+    later.reset()
+    assert later.calibration is detector.calibration
+    detector.reset()
+    assert detector.calibration.passages == 0
+
+
+def test_a_calibration_of_other_channels_is_refused():
+    with pytest.raises(InputError, match="calibration is of channels a, b"):
+        TrainDetector(RAILS, calibration=Calibration.untaught(NAMES, 0.02))
