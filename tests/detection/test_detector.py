@@ -319,7 +319,8 @@ def test_drifting_sensor_is_told():
 
     events, _ = faulty(change)
     assert ("slab_mid", "drifting") in states(events)
-    assert passages(events)[0].values["type"] == "CRH3"
+    # bursts without a deflection: CRH3 and CRH2 may not be told apart
+    assert passages(events)[0].values["families"][0][0] == CATALOGUE["CRH3"].family
 
 
 def test_clock_offset_is_told_and_measured():
