@@ -17,11 +17,11 @@ from . import report
 from .calibration import POSITION_SIGMA, Calibration
 from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
-from .features import FRAME, GroupStream
+from .features import GroupStream
 from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import Partial, departed, provisional
-from .onset import Trigger
+from .onset import Trigger, quietest
 from .passage import Passage, Record, excited, find_passages
 
 Array = NDArray[np.float64]
@@ -42,9 +42,10 @@ _UPDATE_GROWTH = 0.25  # of the time passed, between trials
 _UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
 _UPDATE_WHEELSETS = (4, 12)  # by pattern, on one channel
 _UPDATE_WITHIN = 100.0  # m at the lowest speed: what is not clear by then is no train
-_BEGUN = 4.0  # energy of the first half second over that after the event: it began before
+_BEGUN = 1.6  # energy of the first half second over the quietest: a train was near, 2 dB
 _AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
-_QUIET_NS = 1_000_000_000
+_JITTER = 3.0  # times the median deviation of a step, which rounding of the times reaches
+_AHEAD = 1.0  # m before a first wheelset that is on record
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
@@ -91,10 +92,26 @@ class _Group:
 
     def __init__(self, block: Waveform, index: list[int], keep_s: float) -> None:
         self.stream = GroupStream(block.channels, block.dt_ns, keep_s)
-        self.trigger = Trigger(len(block.channels), self.stream.bands, FRAME * self.stream.step)
         self.index = index
         self.next_bin = 0
         self.restarts = 0
+        self.calm_s = 0.0
+        self.trigger = self._trigger()
+
+    def _trigger(self) -> Trigger:
+        return Trigger(len(self.index), self.stream.bands, self.stream.frame_s)
+
+    def quietest(self, until_ns: int) -> Array:
+        """Noise floors by the quietest stretch up to a time, (channels, bands)."""
+        stream = self.stream
+        rows = (stream.measured(row, until_ns) for row in range(len(self.index)))
+        return np.stack([quietest(row, stream.bands, stream.frame_s) for row in rows])
+
+    def begin_again(self, floor: Array) -> None:
+        """Take the frames from the first one on, with noise floors (channels, bands)."""
+        self.next_bin = 0
+        self.trigger = self._trigger()
+        self.trigger.start_from(floor)
 
 
 @dataclass
@@ -161,6 +178,9 @@ class TrainDetector:
         self._done_ns = 0
         self._event: _Event | None = None
         self._beginning = True
+        self._replay = False
+        self._inside = False
+        self._replayed_ns = -(2**62)
         self._health = HealthBook(self.channels)
         self._lowest = np.full(len(self.channels), np.inf)
         self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
@@ -184,12 +204,18 @@ class TrainDetector:
 
     def finish(self) -> list[TrainEvent]:
         """End of the stream: events of a train still passing, flagged ``truncated_end``."""
-        events = self._run(max((g.stream.end_ns or 0 for g in self._groups.values()), default=0))
+        now = max((g.stream.end_ns or 0 for g in self._groups.values()), default=0)
+        events = self._run(now)
         for group in self._groups.values():
             group.stream.flush()
         events += self._frames(2**62)
+        if self._beginning:
+            self._beginning = False
+            self._anew(now)
+            if self._replay:
+                self._replay = False
+                events += self._frames(2**62)
         if self._event is not None:
-            now = max((g.stream.end_ns or 0 for g in self._groups.values()), default=0)
             events += self._close(now)
         return events
 
@@ -251,29 +277,64 @@ class TrainDetector:
         """Take the decision frames that end before a time, in order of time over all groups."""
         ready = []
         for order, group in enumerate(self._groups.values()):
-            while group.next_bin + FRAME <= group.stream.bins:
+            while group.next_bin + group.stream.frame_bins <= group.stream.bins:
                 frame = group.stream.frame(group.next_bin)
                 if frame.end_ns > until_ns:
                     break
-                group.next_bin += FRAME
+                group.next_bin += group.stream.frame_bins
                 ready.append((frame.end_ns, order, group, frame))
         ready.sort(key=lambda item: item[:2])
         events: list[TrainEvent] = []
         for end_ns, _, group, frame in ready:
             in_event = self._event is not None
             active = group.trigger.step(frame.energy, frame.valid & ~frame.still, frozen=in_event)
-            events += self._health.step(
-                end_ns,
-                FRAME * group.stream.step,
-                group.index,
-                frame.mean,
-                np.sqrt(np.max(np.nan_to_num(group.trigger.floor, nan=np.inf), axis=1)),
-                frame.still,
-                frame.valid,
-                in_event,
-            )
+            if end_ns > self._replayed_ns:
+                events += self._health.step(
+                    end_ns,
+                    group.stream.frame_s,
+                    group.index,
+                    frame.mean,
+                    np.sqrt(np.max(np.nan_to_num(group.trigger.floor, nan=np.inf), axis=1)),
+                    frame.still,
+                    frame.valid,
+                    in_event,
+                )
             events += self._decide(end_ns, group, active)
+            if self._beginning and self._event is None and self._calmed(group):
+                self._beginning = False
+                self._anew(end_ns)
+            if self._replay:
+                self._replay = False
+                return events + self._frames(until_ns)
         return events
+
+    def _calmed(self, group: _Group) -> bool:
+        """Whether a group has become much quieter than when its floor was learned, for a while."""
+        recent = group.trigger.recent
+        calm = bool(np.any((recent > 0) & (group.trigger.first_floor > _BEGUN * recent)))
+        group.calm_s = group.calm_s + group.stream.frame_s if calm else 0.0
+        return group.calm_s > self.config.hang
+
+    def _anew(self, now_ns: int) -> None:
+        """Begin again at the start of the stream, if a train was near when floors were learned.
+
+        What a record shows in its first half second is taken for noise, unless something later in
+        it is much quieter: then that is the noise, and the record is gone through once more.
+        """
+        groups = tuple(self._groups.values())
+        if any(group.stream.dropped_bins for group in groups):
+            return
+        floors = [group.quietest(now_ns) for group in groups]
+        pairs = zip(groups, floors, strict=True)
+        if not any(np.any(g.trigger.first_floor > _BEGUN * floor) for g, floor in pairs):
+            return
+        for group, floor in zip(groups, floors, strict=True):
+            group.begin_again(floor)
+        self._event = None
+        self._inside = self._replay = True
+        self._replayed_ns = now_ns
+        self._lowest[:] = np.inf
+        self._active_ns[:] = -(2**62)
 
     def _decide(self, now_ns: int, group: _Group, active: NDArray[np.bool_]) -> list[TrainEvent]:
         events: list[TrainEvent] = []
@@ -282,7 +343,7 @@ class TrainDetector:
             level = float(group.trigger.level[local])
             if self._event is None and self._fresh(channel, level, now_ns):
                 delay = group.stream.shift[group.trigger.band[local]]
-                start = now_ns - round((FRAME * group.stream.step + delay) * 1e9)
+                start = now_ns - round((group.stream.frame_s + delay) * 1e9)
                 self._event = _Event(start, set(), {}, {}, {}, {})
                 self._event.next_update_ns = now_ns + _UPDATE_NS
                 ratio = float(group.trigger.ratio[local])
@@ -351,6 +412,11 @@ class TrainDetector:
         event = self._event
         assert event is not None
         self._event = None
+        if self._beginning:
+            self._beginning = False
+            self._anew(now_ns)
+            if self._replay:
+                return []
         self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
         records = self._records(origin, now_ns)
@@ -359,12 +425,12 @@ class TrainDetector:
             (event.start_ns - origin) * 1e-9 - 0.5,
             (last - origin) * 1e-9 + 0.3,
         )
-        first, self._beginning = self._beginning, False
-        if first and event.start_ns - (self._start_ns or 0) < _BEFORE_NS and self._louder_before():
+        inside, self._inside = self._inside, False
+        found = self._find(records, within)
+        if inside and not self._whole(found, origin):
             part = self._truncated(last, now_ns)
             if part is not None:
                 return part
-        found = self._find(records, within)
         if records and not any(passage.confirmed for passage in found):
             found, swapped = self._try_swapped(records, within, found)
         else:
@@ -409,26 +475,18 @@ class TrainDetector:
     def _rails(self, from_ns: int, to_ns: int) -> list[Record]:
         return [r for r in self._records(from_ns, to_ns) if r.channel.layer == "rail"]
 
-    def _louder_before(self) -> bool:
-        """Whether the noise learned at the start of the stream was none, by what is there now."""
-        for group in self._groups.values():
-            drop = group.trigger.first_floor / group.trigger.recent
-            for row, channel in enumerate(group.index):
-                if (
-                    self.channels[channel].layer == "rail"
-                    and np.nanmax(drop[row], initial=0) > _BEGUN
-                ):
-                    return True
-        return False
+    def _whole(self, found: Sequence[Passage], origin_ns: int) -> bool:
+        """Whether the first of the trains is on record from its first wheelset on."""
+        if not found or not found[0].known:
+            return False
+        best = found[0].hypotheses[0]
+        start = ((self._start_ns or 0) - origin_ns) * 1e-9
+        return float(best.fit.motion.time_at(-_AHEAD)) > start
 
     def _truncated(self, last_ns: int, now_ns: int) -> list[TrainEvent] | None:
         """Events of a train whose beginning is not on record; ``None`` if that is not so."""
         origin = self._start_ns or 0
-        records = []
-        for record in self._rails(origin, now_ns):
-            after = record.window.time > record.window.time[-1] - _QUIET_NS / 2e9
-            floor = np.maximum(np.median(record.window.energy[after], axis=0), 1e-300)
-            records.append(replace(record, floor=floor))
+        records = self._rails(origin, now_ns)
         within = (0.0, (last_ns - origin) * 1e-9 + 0.3)
         mirrored = HeadMatcher(self.catalogue.types, self._limits, mirrored=True)
         found, quiet = departed(records, within, self._limits, mirrored)
@@ -505,17 +563,19 @@ def detect(
     """Events in plain arrays, in the unit they come in (no result depends on it).
 
     Args:
-        time_or_rate: sampling rate (Hz), or the time of every sample (s; equal steps, jumps are
-            gaps).
-        samples: shape (samples,) or (samples, channels).
+        time_or_rate: sampling rate (Hz), or the time of every sample (s; equal steps, perhaps
+            rounded; jumps are gaps).
+        samples: shape (samples,) or (samples, channels); NaN where missing.
         channels: one per column.
+        catalogue: train types; the shipped one by default. ``Catalogue.from_axles`` makes one.
+        config: settings.
 
     Raises:
-        InputError: shapes disagree, or the times do not increase.
+        InputError: shapes disagree, numbers are none, or the times do not increase.
     """
-    data = np.asarray(samples, dtype=np.float64)
-    data = data[:, None] if data.ndim == 1 else data
     sensors = (channels,) if isinstance(channels, Channel) else tuple(channels)
+    data = _numbers("samples", samples)
+    data = data[:, None] if data.ndim == 1 else data
     if data.ndim != 2 or data.shape[1] != len(sensors):
         raise InputError(
             f"samples of shape {data.shape} must be (samples, {len(sensors)}), one column per "
@@ -523,9 +583,7 @@ def detect(
         )
     names = tuple(channel.name for channel in sensors)
     detector = TrainDetector(sensors, catalogue, config)
-    clock = np.asarray(time_or_rate, dtype=np.float64)
-    # single precision, as in a Waveform: bring large counts and their offset into range first
-    data = data - np.nanmedian(data, axis=0) if np.isfinite(data).any() else data
+    clock = _numbers("time_or_rate", time_or_rate)
     if clock.ndim == 0:
         if not 50 <= float(clock) <= 1e6:
             raise InputError(f"rate = {float(clock)} Hz must lie from 50 Hz to 1 MHz")
@@ -534,16 +592,76 @@ def detect(
     else:
         if clock.shape != (len(data),) or len(data) < 2:
             raise InputError(f"time of shape {clock.shape} must be ({len(data)},), 2 or more")
-        steps = np.diff(clock)
-        if not np.all(steps > 0):
-            raise InputError("time must increase from sample to sample (s)")
-        dt_ns = round(1e9 * float(np.median(steps)))
-        cuts = np.flatnonzero(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) + 1
-        limits = [0, *(int(c) for c in cuts), len(data)]
-        pieces = list(pairwise(limits))
-        start_ns = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
+        dt_ns, pieces, start_ns = _grid(clock)
+    data = _in_range(data)
     events: list[TrainEvent] = []
     for (first, last), stamp in zip(pieces, start_ns, strict=True):
         block = Waveform(int(stamp), dt_ns, names, data[first:last].astype(np.float32))
         events += detector.process(block)
-    return events + detector.finish()
+    return _corrected(events + detector.finish())
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiubO":
+        raise InputError(f"{name} of type {array.dtype} must be real numbers")
+    try:
+        return array.astype(np.float64)
+    except (TypeError, ValueError) as failure:
+        raise InputError(f"{name} must be real numbers: {failure}") from None
+
+
+def _in_range(data: Array) -> Array:
+    """Samples about 0 and of order 1, per channel by a power of two: they become single precision.
+
+    No result depends on the unit, nor on an offset.
+    """
+    data = np.where(np.isfinite(data), data, np.nan)
+    for column in data.T:
+        known = np.isfinite(column)
+        if known.any():
+            column[:] = _to_one(column, known)
+            column -= np.median(column[known])
+            column[:] = _to_one(column, known)
+    return data
+
+
+def _to_one(column: Array, known: NDArray[np.bool_]) -> Array:
+    return np.asarray(np.ldexp(column, -int(np.frexp(np.max(np.abs(column[known])))[1])))
+
+
+def _grid(clock: Array) -> tuple[int, list[tuple[int, int]], NDArray[np.int64]]:
+    """Step (ns) of the times of samples (s), pieces without a gap, and their stamps (ns).
+
+    Times may be rounded or jitter: the step is the mean over pieces.
+    """
+    steps = np.diff(clock)
+    if not (np.isfinite(clock).all() and np.max(np.abs(clock)) < 9e9):
+        raise InputError("time must be finite and within 9e9 s of 0")
+    if np.any(steps < 0) or clock[-1] <= clock[0]:
+        raise InputError("time must increase from sample to sample (s)")
+    span = min(64, len(steps))
+    typical = float(np.median(clock[span:] - clock[:-span])) / span
+    if typical <= 0:
+        raise InputError("time must increase from sample to sample (s)")
+    jitter = float(np.median(np.abs(steps - typical)))
+    gap = np.abs(steps - typical) > 0.5 * typical + _JITTER * jitter
+    mean = float(np.mean(steps[~gap])) if not gap.all() else typical
+    cuts = [0, *(int(c) + 1 for c in np.flatnonzero(gap)), len(clock)]
+    pieces = list(pairwise(cuts))
+    stamps = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
+    return max(1, round(1e9 * mean)), pieces, stamps
+
+
+def _corrected(events: Sequence[TrainEvent]) -> list[TrainEvent]:
+    """Events without those that a later look at the beginning of the record has replaced."""
+    out: list[TrainEvent] = []
+    for event in events:
+        if event.kind == "arrival" and any(
+            e.kind == "arrival" and e.stamp_ns >= event.stamp_ns for e in out
+        ):
+            out = [e for e in out if e.kind == "health"]
+        out.append(event)
+    return out

@@ -46,6 +46,7 @@ _GAP_NEAR, _GAP_FAR = 0.2, 0.6  # m, spread of wheelbases and of the other gaps 
 _NEAR = 3.5  # m
 _CLOCK_S = 0.1
 _OUTLIER = 2.5
+_SAME_PULSE = 1.25  # m, half a wheelbase
 _LEAST_COMMON = 0.75  # share of the places, so that what is left out can be accidents
 _COARSE = 0.2  # m, scatter at which nothing finer than a wheelbase can be told
 _COARSE_COST = 7.0  # ln of odds: its tails are not Gaussian and imitate other gaps
@@ -123,26 +124,32 @@ def _noise(candidate: Candidate) -> float:
     return max(float(np.sqrt(square)), _LEAST_NOISE)
 
 
-def _comparable(candidates: Sequence[Candidate], noise: float) -> dict[int, NDArray[np.bool_]]:
-    """(channels, wheelsets) by number of wheelsets: places that fit every candidate of that number.
+def _same_pulses(a: Candidate, b: Candidate) -> bool:
+    """Whether two candidates take the same pulses for their wheelsets, one by one."""
+    if a.places.size != b.places.size:
+        return False
+    apart = np.abs(a.fit.time - b.fit.time) * abs(a.fit.motion.speed)
+    return float(np.median(apart)) < _SAME_PULSE
+
+
+def _comparable(
+    candidate: Candidate, likely: Sequence[Candidate], noise: float
+) -> NDArray[np.bool_] | None:
+    """(channels, wheelsets): places of a candidate that fit every likely one of the same pulses.
 
     Every candidate looks for its wheelsets in windows of its own; a pulse mistaken for a wheelset
     in one of them is an accident, and must not choose between types that differ by a per cent.
-    Many such places are no accident but a wrong type: then all places count.
+    Many such places are no accident but a wrong type: then all places count. A train of equal cars
+    fits again one car later, but there its wheelsets are others.
     """
-    common: dict[int, NDArray[np.bool_]] = {}
-    for c in candidates:
-        if c.fit.scale > 2 * noise:
-            continue
-        count = c.places.size
-        good = c.fit.observed & (np.abs(c.fit.residual) <= _OUTLIER * noise)
-        common[count] = good & common[count] if count in common else good
-    return {
-        count: good
-        for count, good in common.items()
-        if good.sum()
-        >= _LEAST_COMMON * min(c.fit.observed.sum() for c in candidates if c.places.size == count)
-    }
+    peers = [c for c in likely if c.fit.scale <= 2 * noise and _same_pulses(candidate, c)]
+    if not peers:
+        return None
+    good = np.all(
+        [c.fit.observed & (np.abs(c.fit.residual) <= _OUTLIER * noise) for c in peers], axis=0
+    )
+    enough = _LEAST_COMMON * min(c.fit.observed.sum() for c in peers)
+    return np.asarray(good) if good.sum() >= enough else None
 
 
 def _model(
@@ -199,12 +206,12 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     likely = [c for c in candidates if c.score > top - 2 * _SCORE_NOISE]
     # classes of few wheelsets understate it
     noise = max(min(_noise(c) for c in likely), _LEAST_SHARE * min(c.fit.scale for c in likely))
-    common = _comparable(likely, noise)
     speed = max(likely, key=lambda c: c.score).fit.motion.speed
     found: list[tuple[float, int, Kind, int, Motion]] = []
     for index, c in enumerate(candidates):
         channels, axles = c.fit.observed.shape
-        use = c.fit.observed & common[axles] if axles in common else c.fit.observed
+        common = _comparable(c, likely, noise)
+        use = c.fit.observed if common is None else c.fit.observed & common
         classes = _classes(c.places)
         base: list[Array] = []
         for k in range(channels):

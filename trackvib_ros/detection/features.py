@@ -30,8 +30,8 @@ Their filters have linear phase (Bessel low-pass; delayed signal minus its movin
 high-pass): the slow pulse of a wheel at 40 km/h keeps its symmetry and its place.
 """
 
-FRAME = 10
-"""Bins per decision frame: about 10 ms."""
+FRAME_S = 0.01
+"""Length of a decision frame (s), nearly: a whole number of bins."""
 
 _BIN_RATE = 1000.0
 _INNER_RATE = 5000.0  # Hz, band filters run at this rate or up to twice it
@@ -126,6 +126,8 @@ class GroupStream:
         inner = self.rate / self._first
         self.decimation = self._first * max(1, int(inner // _BIN_RATE))
         self.step = self.decimation / self.rate
+        self.frame_bins = max(1, round(FRAME_S / self.step))
+        self.frame_s = self.frame_bins * self.step
         self.bands = bands_for(self.rate)
         top = min(_INNER_TOP, 0.45 * self.rate)
         self._front = signal.bessel(4, top, "low", norm="mag", fs=self.rate, output="sos")
@@ -349,16 +351,30 @@ class GroupStream:
     def frame(self, first_bin: int) -> Frame:
         """What one decision frame holds."""
         start = first_bin - self.dropped_bins
-        part = self._ring[start : start + FRAME]
+        part = self._ring[start : start + self.frame_bins]
         mean = part.mean(axis=0, dtype=np.float64)
         b = len(self.bands)
         return Frame(
-            end_ns=int(self._stamps[start + FRAME - 1]) + round(self.step * 5e8),
+            end_ns=int(self._stamps[start + self.frame_bins - 1]) + round(self.step * 5e8),
             energy=mean[:, :b],
             valid=mean[:, b + 3] > 0.7,
             still=part[:, :, b + 2].min(axis=0) >= self.decimation,
             mean=mean[:, b + 5],
         )
+
+    def measured(self, channel: int, until_ns: int) -> Array:
+        """Energies of the measured frames up to a time, shape (frames, bands).
+
+        Frames are those of :meth:`frame`, as far as the ring still holds them.
+        """
+        count = int(np.searchsorted(self._stamps[: self._fill], until_ns)) // self.frame_bins
+        part = self._ring[: count * self.frame_bins, channel]
+        part = part.reshape(count, self.frame_bins, part.shape[1])
+        b = len(self.bands)
+        energy = part[:, :, :b].mean(axis=1, dtype=np.float64)
+        moving = part[:, :, b + 2].min(axis=1) < self.decimation
+        usable = (part[:, :, b + 3].mean(axis=1) > 0.7) & moving & (energy > 0).all(axis=1)
+        return np.asarray(energy[usable])
 
     def window(self, channel: int, from_ns: int, to_ns: int) -> Window:
         """Features of one channel between two times, as far as the ring still holds them."""

@@ -23,6 +23,8 @@ _LEAST_RATIO = 1.6
 _WARM_UP = 50  # frames
 _FLOOR_FRAMES = 800.0  # time constant of the floor
 _FALL_FRAMES = 50.0  # faster downwards: a floor learned inside a train is wrong
+_QUIET_FRAMES = 8  # 80 ms: the least that a record leaves before its train
+_QUIET_RANGE = 4.0  # over the quietest, still the same noise: 6 dB
 
 
 def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
@@ -33,6 +35,33 @@ def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
             freedom = max(1.0, 2 * (high - low) * frames * frame_s)
             table[w, b] = stats.chi2.isf(_FALSE_ALARM, freedom) / freedom
     return np.maximum(_MARGIN * table, _LEAST_RATIO)
+
+
+def quietest(energy: Array, bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
+    """Noise floor by the quietest stretch of a record, whatever came first in it, shape (bands,).
+
+    The least of many averages of a constant noise lies below its mean, by the same chi-square law
+    as the thresholds; that much is made up for.
+
+    Args:
+        energy: measured frames, shape (frames, bands).
+        bands: their limits (Hz).
+        frame_s: length of a frame (s).
+
+    Returns:
+        NaN where there are too few frames.
+    """
+    if len(energy) < _QUIET_FRAMES:
+        return np.full(energy.shape[1], np.nan)
+    total = np.cumsum(np.concatenate([np.zeros((1, energy.shape[1])), energy]), axis=0)
+    mean = (total[_QUIET_FRAMES:] - total[:-_QUIET_FRAMES]) / _QUIET_FRAMES
+    least = mean.min(axis=0)
+    for b, (low, high) in enumerate(bands):
+        alike = max(1.0, np.sum(mean[:, b] < _QUIET_RANGE * least[b]) / _QUIET_FRAMES)
+        freedom = max(1.0, 2 * (high - low) * _QUIET_FRAMES * frame_s)
+        # median of the least of so many independent averages
+        least[b] /= stats.chi2.isf(0.5 ** (1 / alike), freedom) / freedom
+    return np.asarray(least)
 
 
 class Trigger:
@@ -118,6 +147,12 @@ class Trigger:
                 10 * np.log10(self.first_floor[learn] / self.floor[learn]), axis=1
             )
         return self.active
+
+    def start_from(self, floor: Array) -> None:
+        """Begin with known floors, (channels, bands); NaN where one has to be learned."""
+        known = np.isfinite(floor).all(axis=1) & (floor > 0).all(axis=1)
+        self.floor[known] = self.first_floor[known] = floor[known]
+        self.seen[known] = _WARM_UP
 
     def relearn(self, channel: int) -> None:
         """Forget the floor of a channel."""

@@ -21,6 +21,8 @@ _DIRECTION = {1: "forward", -1: "backward", 0: "unknown"}
 _UNITS = {1: "single", 2: "double"}
 _GEOMETRY = 0.03  # m, wheelsets of a train against its type
 _PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
+_MARGIN_S = 0.15  # of a record about the strong energy of a train that is wholly on it
+_MARGIN = 0.5  # m, the same about its wheelsets if these are known
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
 
 
@@ -162,6 +164,11 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
     """Flags from the samples: clipped, gaps, record shorter than the train."""
     flags = set()
     start, stop = passage.interval
+    margin = _MARGIN_S
+    if passage.known:
+        best = passage.hypotheses[0]
+        start, stop = (float(best.fit.motion.time_at(best.places[i])) for i in (0, -1))
+        margin = _MARGIN / float(best.fit.motion.speed_at(best.mid_time))
     for record in records:
         window = record.window
         inside = (window.time >= start) & (window.time <= stop)
@@ -171,9 +178,9 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
             flags.add("clipped")
         if np.mean(window.holes[inside]) > 0.002 or not window.valid[inside].all():
             flags.add("gaps")
-        if start - window.time[0] < 0.15:
+        if start - window.time[0] < margin:
             flags.add("truncated_start")
-        if window.time[-1] - stop < 0.15:
+        if window.time[-1] - stop < margin:
             flags.add("truncated_end")
     return sorted(flags)
 
