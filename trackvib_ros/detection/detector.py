@@ -351,7 +351,7 @@ class TrainDetector:
             self._active_ns[channel] = now_ns
             if self._event is not None:
                 self._event.triggered.add(channel)
-                self._follow(self._event, channel, level, now_ns)
+                self._follow(self._event, channel, float(group.trigger.steady[local]), now_ns)
         if self._event is None:
             self._lowest[group.index] = np.minimum(
                 self._lowest[group.index], np.maximum(group.trigger.level, 1.0)

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 WINDOWS = (1, 2, 4, 8, 16)
 """Lengths of the short-term averages (frames)."""
 
+_UPPER = 3 * WINDOWS[-1] // 4 - 1  # rank of the upper quartile of the longest window
 _FALSE_ALARM = 1e-9  # per test, Gaussian noise: 0.007 an hour and channel before the margin
 _MARGIN = 1.2  # the floor itself is an estimate
 _LEAST_RATIO = 1.6
@@ -74,6 +75,8 @@ class Trigger:
         first_floor: the floor as it was first learned.
         recent: mean energy over the longest window.
         level: energy of the longest window over the floor, the largest of the bands.
+        steady: the same of its upper quartile of frames, which the blows of a wheel flat, a frame
+            or two each, do not raise.
         active: ``ratio`` > 1.
         fall_db: by how much the floor has fallen since it was first learned.
     """
@@ -89,6 +92,7 @@ class Trigger:
         self.seen = np.zeros(channels, dtype=np.int64)
         self.fall_db = np.zeros(channels)
         self.level = np.ones(channels)
+        self.steady = np.ones(channels)
         self.band = np.zeros(channels, dtype=np.int64)
         self._history = np.zeros((WINDOWS[-1], *shape))
         self._filled = np.zeros(channels, dtype=np.int64)
@@ -134,6 +138,8 @@ class Trigger:
                 self.band = np.where(peak > excess, band, self.band)
                 np.maximum(excess, peak, out=excess)
             self.level = np.nanmax(mean, axis=1, initial=0.0)
+            upper = np.partition(self._history, _UPPER, axis=0)[_UPPER] / self.floor
+            self.steady = np.nanmax(upper, axis=1, initial=0.0)
             self.recent = mean * self.floor
         self.ratio = np.where(usable & ready, excess, 0.0)
         self.active = self.ratio > 1.0

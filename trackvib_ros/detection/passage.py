@@ -13,10 +13,10 @@ from .blind import Blind, describe
 from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
 from .events import Channel
-from .evidence import Candidate, Explanation, explain
+from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN, Candidate, Explanation, explain
 from .features import Window
 from .kinematics import Motion, robust_scale
-from .pattern import Match, Trace, refine, scan
+from .pattern import Match, Trace, independent, refine, scan, stretched
 from .place import Wave
 
 Array = NDArray[np.float64]
@@ -32,7 +32,8 @@ SCATTERED = 0.5
 pulses that have nothing to do with the type scatter by 0.635 m."""
 
 SCATTERED_SCORE = 0.70
-"""Least pattern correlation at which a type is named by its pattern alone."""
+"""Least pattern correlation at which a type is named by the pattern of one channel alone. Two that
+show it in step are as significant at 0.535 (1 - r² is the root of that of one)."""
 
 CONFIRM_CORRELATION = 0.6
 """Least correlation of the envelopes of two channels for a train of unknown type."""
@@ -51,6 +52,7 @@ _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
 _STRETCH = (
     1.25  # a delay that fits no type better than this is a clock's fault, not an unknown type
 )
+_STRETCH_STEP = 0.02  # 0.4 m of 20 m, within the smoothing of the scan
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,8 @@ class Passage:
         if not self.hypotheses:
             return False
         scattered = self.hypotheses[0].fit.scale > SCATTERED
-        return self.score >= (SCATTERED_SCORE if scattered else least)
+        alone = self.direction == 0
+        return self.score >= (SCATTERED_SCORE if scattered and alone else least)
 
     @property
     def confirmed(self) -> bool:
@@ -152,7 +155,7 @@ class Passage:
         )
 
 
-def traces_of(record: Record, within: tuple[float, float]) -> list[Trace]:
+def traces_of(record: Record, within: tuple[float, float], limited: bool = False) -> list[Trace]:
     """One trace per band, quiet outside an interval (s)."""
     window = record.window
     return [
@@ -165,6 +168,7 @@ def traces_of(record: Record, within: tuple[float, float]) -> list[Trace]:
             float(record.floor[b]),
             window.step,
             (within[0] - 0.3, within[1] + 0.3),
+            limited,
         )
         for b in range(len(window.bands))
     ]
@@ -229,23 +233,100 @@ def _scan_channel(
     limits: tuple[float, float],
 ) -> _Scanned | None:
     found = []
-    traces = traces_of(record, within)
+    whole = traces_of(record, within)
     window = record.window
     wave = Wave(window.time - window.low_shift, window.low, window.valid)
-    for trace, band in zip(traces, window.bands, strict=True):
+    for trace, limited, band in zip(
+        whole, traces_of(record, within, limited=True), window.bands, strict=True
+    ):
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
-        matches = scan(trace, interval, trains, limits)
-        found.append(_Scanned(trace, traces[0], wave, band, interval, matches))
+        ways = [
+            _Scanned(t, whole[0], wave, band, interval, scan([(t, 0.0)], interval, trains, limits))
+            for t in (trace, limited)
+        ]
+        found.append(max(ways, key=lambda s: s.score))
     if not found:
         return None
     top = max(s.score for s in found)
-    if top < HOPELESS_SCORE:
-        return max(found, key=lambda s: s.score)
     # the deflection under a wheel lies at the wheel; high bands peak where the rail is rough
-    best = next(s for s in found if s.score > top - _LOW_BAND_BONUS)
-    return replace(best, matches=refine(best.trace, best.matches, best.interval))
+    return next(
+        s for s in found if s.score >= top - (_LOW_BAND_BONUS if top > HOPELESS_SCORE else 0)
+    )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Types in the rail channels, best first, and how each channel lags behind the first (s)."""
+
+    matches: list[Match]
+    direction: int
+    kept: list[tuple[_Scanned, float]]
+    offsets: list[tuple[str, float, float]]
+
+
+def _log_likelihood(score: Array, levels: float) -> Array:
+    """Of normal levels, so many of them independent, that correlate with a pattern by ``score``."""
+    return np.asarray(-0.5 * levels * np.log(1 - np.minimum(score, 0.999) ** 2))
+
+
+def _in_step(
+    usable: Sequence[_Scanned], trains: Sequence[TrainType], limits: tuple[float, float]
+) -> _Seen | None:
+    """The types in all channels at once: every wheelset passes each after its distance.
+
+    ``None`` if the channels one by one show so much more that a wrong clock is likelier.
+    """
+    reference = usable[0]
+    apart = [s.trace.x - reference.trace.x for s in usable]
+    if max(apart) < 0.5:
+        return None
+    duration = max(s.interval[1] - s.interval[0] for s in usable)
+    middle = float(np.mean([sum(s.interval) / 2 for s in usable]))
+    interval = (middle - duration / 2, middle + duration / 2)
+    best: tuple[int, list[Match]] | None = None
+    for direction in (1, -1):
+        placed = [(s.trace, direction * x) for s, x in zip(usable, apart, strict=True)]
+        matches = scan(placed, interval, trains, limits)
+        if matches and (best is None or matches[0].score > best[1][0].score):
+            best = direction, matches
+    if best is None or best[1][0].score < HOPELESS_SCORE:
+        return None
+    direction, matches = best
+    placed = [(s.trace, direction * x) for s, x in zip(usable, apart, strict=True)]
+    factors = np.exp(np.arange(-np.log(_STRETCH), np.log(_STRETCH) + 1e-9, _STRETCH_STEP))
+    scores = stretched(placed, matches[0], interval, factors)
+    levels = independent(matches[0].train.span) * len(usable) / 2
+    alone = float(np.mean([np.log(1 - s.score**2) for s in usable]))
+    factor = 1.0
+    if levels * np.log((1 - matches[0].score ** 2) / (1 - scores.max() ** 2)) > -np.log(
+        PRIOR_UNKNOWN
+    ):
+        factor = float(factors[np.argmax(scores)])
+    shown = max(matches[0].score, float(scores.max()))
+    if levels * (np.log(1 - shown**2) - alone) > -np.log(PRIOR_CLOCK):
+        return None
+    placed = [(trace, factor * shift) for trace, shift in placed]
+    matches = refine(placed, matches, interval)
+    speed = matches[0].speed
+    kept = [(s, shift / speed) for s, (_, shift) in zip(usable, placed, strict=True)]
+    return _Seen(matches, direction, kept, [])
+
+
+def _one_by_one(usable: Sequence[_Scanned]) -> _Seen:
+    """The types in the first channel, with what the others show of them."""
+    fine = [replace(s, matches=refine([(s.trace, 0.0)], s.matches, s.interval)) for s in usable]
+    direction, kept, offsets = _delays(fine, fine[0].matches[0])
+    table: dict[tuple[str, bool], float] = {}
+    for s, _ in kept:
+        for match in s.matches:
+            key = (match.train.name, match.reverse)
+            table[key] = table.get(key, 0.0) + match.score / len(kept)
+    matches = [
+        replace(match, score=table[match.train.name, match.reverse]) for match in fine[0].matches
+    ]
+    return _Seen(matches, direction, kept, offsets)
 
 
 def _motion(match: Match) -> Motion:
@@ -292,12 +373,11 @@ def find_passage(
         max(scanned, key=lambda s: s.score)
     ]
     reference = usable[0]
-    interval = reference.interval
-    if reference.score < HOPELESS_SCORE:
+    if top < HOPELESS_SCORE:
         traces = tuple(s.trace for s in scanned)
-        passage = Passage(interval, traces, reference.band, (), 0, coarse_score=reference.score)
+        passage = Passage(reference.interval, traces, reference.band, (), 0, coarse_score=top)
     else:
-        passage = _fit_hypotheses(usable, reference, site)
+        passage = _fit_hypotheses(usable, trains, limits, site)
     if passage.known:
         return passage
     guess = None
@@ -340,22 +420,24 @@ def _delays(
     return (votes[0] if votes else 0), kept, offsets
 
 
-def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned, site: Calibration) -> Passage:
-    best = reference.matches[0]
-    direction, kept, offsets = _delays(usable, best)
-    table: dict[tuple[str, bool], list[float]] = {}
-    for s, _ in kept:
-        for match in s.matches:
-            table.setdefault((match.train.name, match.reverse), []).append(match.score)
-    trains: list[Hypothesis] = []
+def _fit_hypotheses(
+    usable: Sequence[_Scanned],
+    trains: Sequence[TrainType],
+    limits: tuple[float, float],
+    site: Calibration,
+) -> Passage:
+    reference = usable[0]
+    seen = _in_step(usable, trains, limits) or _one_by_one(usable)
+    direction, kept, offsets = seen.direction, seen.kept, seen.offsets
+    fitted: list[Hypothesis] = []
     aligned: list[list[Array]] = []
     names = tuple(s.trace.name for s, _ in kept)
     stated = np.array([s.trace.x - reference.trace.x for s, _ in kept])
     offset, covariance = site.relative(names)
     shifts = (direction or 1) * (stated + offset)
-    for match in reference.matches:
-        score = sum(table[match.train.name, match.reverse]) / len(kept)
-        if score < best.score - 0.25:
+    for match in seen.matches:
+        score = match.score
+        if score < seen.matches[0].score - 0.25:
             continue
         places = match.train.oriented(match.reverse)
         aligned.append([places + delay * match.speed for _, delay in kept])
@@ -370,25 +452,26 @@ def _fit_hypotheses(usable: Sequence[_Scanned], reference: _Scanned, site: Calib
         if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
             aligned.pop()
             continue
-        trains.append(Hypothesis(match.train, match.reverse, direction, score, fit))
-    trains = _same_times(trains, aligned)
-    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance) for h in trains]
+        fitted.append(Hypothesis(match.train, match.reverse, direction, score, fit))
+    fitted = _same_times(fitted, aligned)
+    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance) for h in fitted]
     explanations = explain(candidates)
     if explanations and explanations[0].kind == "clock":
         wrong = kept[explanations[0].channel][0]
-        fit, motion = trains[explanations[0].candidate].fit, explanations[0].motion
+        fit, motion = fitted[explanations[0].candidate].fit, explanations[0].motion
         k = explanations[0].channel
         late = fit.time[k] - motion.time_at(
             candidates[explanations[0].candidate].places + shifts[k]
         )
         told = (wrong.trace.name, float(np.median(late)), 0.2 / motion.speed)
-        passage = _fit_hypotheses([s for s in usable if s is not wrong], reference, site)
+        rest = [s for s in usable if s.trace is not wrong.trace]
+        passage = _fit_hypotheses(rest, trains, limits, site)
         return replace(
             passage,
             clock_offset=(*passage.clock_offset, told),
             quality=tuple({*passage.quality, "unsynchronised"}),
         )
-    hypotheses = _with_probabilities(trains, explanations)
+    hypotheses = _with_probabilities(fitted, explanations)
     passage = Passage(
         interval=reference.interval,
         traces=tuple(s.trace for s, _ in kept),

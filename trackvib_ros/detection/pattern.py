@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 DYNAMIC_RANGE = 300.0
 """Energy range below the strong axles that counts (25 dB)."""
 
+_TYPICAL = 0.85  # quantile: a third of a train is within 1 m of a wheelset, half of that is above
 _COARSE = 1.8  # m, smoothing of the first pass
 _COARSE_BEND = 2.0  # m
 _SPEED_STEP = 0.016
@@ -41,6 +43,8 @@ class Trace:
         floor: noise floor of the energy.
         step: bin length (s).
         within: interval of interest (s); outside it the trace is quiet.
+        limited: whether patterns are looked for in energy that no bin exceeds a typical wheelset:
+            wheel flats hit the rail where they please, far above the wheelsets, for a few ms.
     """
 
     def __init__(
@@ -53,6 +57,7 @@ class Trace:
         floor: float,
         step: float,
         within: tuple[float, float] = (-np.inf, np.inf),
+        limited: bool = False,
     ) -> None:
         self.name, self.x, self.time, self.step = name, x, time, step
         self.valid = valid
@@ -73,11 +78,18 @@ class Trace:
         widths = np.diff(edges)
         self._edges = edges
         self._sum = np.concatenate([[0.0], np.cumsum(filled * widths)])
+        self._limited = self._sum
+        if limited and known.size:
+            typical = max(float(np.quantile(filled[known], _TYPICAL)), self.base)
+            self._limited = np.concatenate([[0.0], np.cumsum(np.minimum(filled, typical) * widths)])
         self._known = np.concatenate([[0.0], np.cumsum(valid * widths)])
 
     def mean(self, start: Array, stop: Array) -> Array:
         """Mean energy between two times (s); :attr:`noise` outside the record."""
-        total = np.interp(stop, self._edges, self._sum) - np.interp(start, self._edges, self._sum)
+        return self._mean(self._sum, start, stop)
+
+    def _mean(self, sums: Array, start: Array, stop: Array) -> Array:
+        total = np.interp(stop, self._edges, sums) - np.interp(start, self._edges, sums)
         low, high = self._edges[0], self._edges[-1]
         length = np.clip(stop, low, high) - np.clip(start, low, high)
         return np.where(length > 0, total / np.maximum(length, 1e-12), self.noise)
@@ -85,6 +97,10 @@ class Trace:
     def level(self, start: Array, stop: Array) -> Array:
         """ln of the mean energy over :attr:`base`, not below 0."""
         return np.log(np.maximum(self.mean(start, stop) / self.base, 1.0))
+
+    def pattern_level(self, start: Array, stop: Array) -> Array:
+        """The level in which patterns are looked for, limited if so asked."""
+        return np.log(np.maximum(self._mean(self._limited, start, stop) / self.base, 1.0))
 
     def coverage(self, start: Array, stop: Array) -> Array:
         """Fraction of an interval that was measured."""
@@ -142,12 +158,16 @@ def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: 
     reachable = square > 0.01 * v * v
     root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
     times = epoch + 2 * edges / (v + root)
-    level = trace.level(times[:, :-1], times[:, 1:])
+    level = trace.pattern_level(times[:, :-1], times[:, 1:])
     return np.asarray(np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0))
 
 
+Placed: TypeAlias = tuple[Trace, float]
+"""A rail channel and its shift (m): a wheelset d behind the first passes it at shift + d."""
+
+
 def _scan_once(
-    trace: Trace,
+    traces: Sequence[Placed],
     epoch: float,
     duration: float,
     trains: Sequence[tuple[TrainType, bool]],
@@ -156,7 +176,8 @@ def _scan_once(
     acceleration: float,
     sigma: float,
 ) -> list[Match]:
-    """Best match of every train for one acceleration."""
+    """Best match of every train for one acceleration; its score is the mean of the channels."""
+    apart = max(abs(shift) for _, shift in traces)
     best: list[Match] = []
     found: dict[int, Match] = {}
     chunk = 24
@@ -167,10 +188,10 @@ def _scan_once(
             continue
         longest = max(trains[j][0].span for j in wanted)
         extent = max(part[-1] * duration + 2 * _BACKGROUND, longest + 4 * _BACKGROUND)
+        extent += 2 * apart
         n = int(fft.next_fast_len(int(extent / _CELL) + 1, real=True))
         weights = _weights(n, sigma)
-        signal = fft.rfft(_resample(trace, epoch, part, acceleration, n), axis=1) * weights
-        norm = np.sqrt(np.sum(np.abs(signal) ** 2, axis=1) * 2 / n)
+        signal = _together(traces, epoch, part, acceleration, n, weights)
         for j in wanted:
             train, reverse = trains[j]
             rows = np.flatnonzero((part >= ranges[j][0]) & (part <= ranges[j][1]))
@@ -179,7 +200,7 @@ def _scan_once(
             comb = fft.rfft(_comb(train.oriented(reverse), n)) * weights
             size = np.sqrt(np.sum(np.abs(comb) ** 2) * 2 / n)
             scores = fft.irfft(signal[rows] * np.conj(comb), n, axis=1)
-            scores /= np.maximum(norm[rows, None] * size, 1e-30)
+            scores /= max(size, 1e-30)
             row, offset = np.unravel_index(int(np.argmax(scores)), scores.shape)
             score = float(scores[row, offset])
             if j in found and found[j].score >= score:
@@ -195,6 +216,24 @@ def _scan_once(
     return best
 
 
+def _together(
+    traces: Sequence[Placed],
+    epoch: float,
+    speeds: Array,
+    acceleration: float,
+    n: int,
+    weights: Array,
+) -> NDArray[np.complex128]:
+    """Spectra of the levels, each of norm 1, shifted to the first channel and averaged."""
+    total = np.zeros((speeds.size, n // 2 + 1), dtype=np.complex128)
+    k = 2 * np.pi * np.arange(n // 2 + 1) / (n * _CELL)
+    for trace, shift in traces:
+        signal = fft.rfft(_resample(trace, epoch, speeds, acceleration, n), axis=1) * weights
+        norm = np.sqrt(np.sum(np.abs(signal) ** 2, axis=1, keepdims=True) * 2 / n)
+        total += signal * np.exp(1j * k * shift) / np.maximum(norm, 1e-30)
+    return total / len(traces)
+
+
 def _grid(low: float, high: float, step: float) -> Array:
     count = max(1, int(np.ceil(np.log(high / low) / step)) + 1)
     return np.geomspace(low, high, count)
@@ -208,7 +247,7 @@ def _accelerations(duration: float, step_m: float) -> Array:
 
 
 def scan(
-    trace: Trace,
+    traces: Sequence[Placed],
     interval: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
@@ -217,7 +256,7 @@ def scan(
     """Coarse best matches of the types, at most one per type and orientation, best first.
 
     Args:
-        trace: the rail channel.
+        traces: the rail channels.
         interval: first and last strong energy (s); gives the speeds to try.
         trains: candidate types.
         limits: lowest and highest speed (m/s).
@@ -245,7 +284,7 @@ def scan(
     best: dict[tuple[str, bool], Match] = {}
     for acceleration in _accelerations(duration, _COARSE_BEND):
         for match in _scan_once(
-            trace,
+            traces,
             epoch,
             duration,
             oriented,
@@ -261,7 +300,10 @@ def scan(
 
 
 def refine(
-    trace: Trace, matches: Sequence[Match], interval: tuple[float, float], keep: int = 8
+    traces: Sequence[Placed],
+    matches: Sequence[Match],
+    interval: tuple[float, float],
+    keep: int = 8,
 ) -> list[Match]:
     """The best coarse matches with finer speeds, accelerations and smoothing, best first."""
     if not matches:
@@ -270,10 +312,43 @@ def refine(
     bends = _accelerations(duration, _COARSE_BEND)
     bend = float(bends[1] - bends[0]) if bends.size > 1 else 0.0
     near = [m for m in matches if m.score > matches[0].score - 0.25][:keep]
-    return sorted((_refine(trace, m, duration, bend) for m in near), key=lambda m: -m.score)
+    return sorted((_refine(traces, m, duration, bend) for m in near), key=lambda m: -m.score)
 
 
-def _refine(trace: Trace, match: Match, duration: float, bend: float) -> Match:
+def independent(span: float) -> float:
+    """Number of independent levels in a train of this length (m) after the coarse smoothing.
+
+    White levels through a filter of power P(k) are worth (L/pi) (int P dk)² / int P² dk, with
+    P = exp(-k² sigma²): L / (sigma sqrt(2 pi)).
+    """
+    return span / (_COARSE * float(np.sqrt(2 * np.pi)))
+
+
+def stretched(
+    traces: Sequence[Placed],
+    match: Match,
+    interval: tuple[float, float],
+    factors: Array,
+) -> Array:
+    """Score of a match whose shifts are each multiplied by a factor, shape (factors,)."""
+    duration = max(interval[1] - interval[0], 0.2)
+    out = np.empty(factors.size)
+    for i, factor in enumerate(factors):
+        (found,) = _scan_once(
+            [(trace, factor * shift) for trace, shift in traces],
+            match.epoch,
+            duration,
+            [(match.train, match.reverse)],
+            [(0.0, np.inf)],
+            np.array([match.speed]),
+            match.acceleration,
+            _COARSE,
+        )
+        out[i] = found.score
+    return out
+
+
+def _refine(traces: Sequence[Placed], match: Match, duration: float, bend: float) -> Match:
     best, top = match, -1.0
     for sigma, spread, points in ((1.1, 1.0, 4), (0.7, 0.35, 3)):
         centre, top = best, -1.0
@@ -283,7 +358,7 @@ def _refine(trace: Trace, match: Match, duration: float, bend: float) -> Match:
         limit = [(0.5 * centre.speed, 2 * centre.speed)]
         for offset in bends:
             for found in _scan_once(
-                trace,
+                traces,
                 centre.epoch,
                 duration,
                 [(match.train, match.reverse)],
