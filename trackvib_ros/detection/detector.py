@@ -23,6 +23,7 @@ from .health import HealthBook, clipped
 from .live import Partial, departed, provisional
 from .onset import Trigger, quietest
 from .passage import Passage, Record, excited, find_passages
+from .response import find_response
 
 Array = NDArray[np.float64]
 
@@ -431,6 +432,11 @@ class TrainDetector:
             part = self._truncated(last, now_ns)
             if part is not None:
                 return part
+        if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
+            away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
+            train = find_response(away, within, self.catalogue.types, self._limits)
+            if train is not None and train.confirmed:
+                return report.response(self.catalogue, records, origin, train)
         if records and not any(passage.confirmed for passage in found):
             found, swapped = self._try_swapped(records, within, found)
         else:

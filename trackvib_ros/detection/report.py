@@ -14,6 +14,7 @@ from .evidence import half_interval
 from .health import clipped
 from .live import Partial
 from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage, Record
+from .response import CONFIRM_EVIDENCE, ResponsePassage
 
 Array = NDArray[np.float64]
 
@@ -371,6 +372,90 @@ def _train(
         )
     )
     return events
+
+
+def response(
+    catalogue: Catalogue, records: Sequence[Record], origin_ns: int, passage: ResponsePassage
+) -> list[TrainEvent]:
+    """Departure and summary of a train on channels that do not show its wheelsets.
+
+    Without axle events: times of single wheelsets would be those of the type, not of a measurement.
+    """
+    best, motion = passage.best, passage.motion
+    train = best.train
+    parts = passage.speeds
+    own = motion.speed_sigma(motion.epoch)
+    half = max(half_interval(parts, best.speed), 1.96 * own)
+    variance = sum(p * ((v - best.speed) ** 2 + s**2) for p, v, s in parts)
+    sigma = max(variance**0.5, own)
+    first, last = (float(motion.time_at(place)) for place in (0.0, train.span))
+    edge = float(np.hypot(passage.middle[1], 0.5 * train.span / best.speed * sigma / best.speed))
+    named = sum(
+        p for p, f in zip(passage.probabilities, passage.fits, strict=True) if f.train is train
+    )
+    grouped: dict[str, float] = {}
+    listed: dict[str, float] = {}
+    for p, fit in zip(passage.probabilities, passage.fits, strict=True):
+        grouped[fit.train.family] = grouped.get(fit.train.family, 0.0) + p
+        listed[fit.train.name] = listed.get(fit.train.name, 0.0) + p
+    reference = passage.channels[0]
+    names = tuple(channel.name for channel in passage.channels)
+    method = "one common response per wheelset, least squares"
+    quality = ["axles_not_visible", "speed_scales_with_type"]
+    for record in records:
+        inside = (record.window.time >= first) & (record.window.time <= last)
+        if record.channel.name in names and inside.any():
+            if clipped(record.window, inside):
+                quality.append("clipped")
+            if not record.window.valid[inside].all():
+                quality.append("gaps")
+
+    def ranked(table: dict[str, float]) -> tuple[tuple[str, float], ...]:
+        pairs = sorted(table.items(), key=lambda item: -item[1])
+        return tuple((name, round(p, 4)) for name, p in pairs if p > 1e-3)
+
+    def stamp(time: float) -> int:
+        return origin_ns + round(time * 1e9)
+
+    duration = last - first
+    place = Estimate(reference.x, 0.0, "m")
+    values: dict[str, Value] = {
+        "grade": CONFIRMED,
+        "reference": reference.name,
+        "reference_x": place,
+        "arrival_ns": stamp(first),
+        "arrival_sigma": edge,
+        "departure_ns": stamp(last),
+        "departure_sigma": edge,
+        "passing_time": Estimate(duration, duration * sigma / best.speed, "s"),
+        "speed": Estimate(best.speed, sigma, "m/s"),
+        "speed_interval": tuple(round(v, 6) for v in (best.speed - half, best.speed + half)),
+        "speed_at": "middle of the train at the reference point",
+        "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
+        "direction": _DIRECTION[passage.direction],
+        "axle_count": train.axles.size,
+        "axle_count_of": "the type",
+        "type": train.name,
+        "type_probability": round(named, 4),
+        "types": ranked(listed),
+        "families": ranked(grouped),
+        "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
+        "cars": train.cars,
+        "units": _UNITS.get(train.units, str(train.units)),
+        "train_length": Estimate(train.length, train.length * sigma / best.speed, "m"),
+        "evidence": round(best.evidence, 1),
+        "speed_passing_time": Estimate(*passage.by_duration, "m/s"),
+        "catalogue": catalogue.version,
+    }
+    if passage.spectral is not None:
+        values["speed_spectrum"] = Estimate(*passage.spectral, "m/s")
+    confidence = float(np.clip(1 - CONFIRM_EVIDENCE / (2 * best.evidence), 0.0, 0.99))
+    flags = tuple(dict.fromkeys(quality))
+    short: dict[str, Value] = {"grade": CONFIRMED, "reference_x": place}
+    return [
+        TrainEvent("departure", stamp(last), edge, confidence, method, names, short, flags),
+        TrainEvent("passage", stamp(first), edge, confidence, method, names, values, flags),
+    ]
 
 
 def _unknown(
