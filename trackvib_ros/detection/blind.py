@@ -9,8 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from .kinematics import HIGH_BAND_POSITION_SIGMA, Motion, robust_scale
+from . import travel
+from .kinematics import Motion
 from .pattern import Trace
+from .record import Record
+from .travel import Pair, Travel
+from .wheelsets import Wheelsets, find, heights
 
 Array = NDArray[np.float64]
 
@@ -25,6 +29,16 @@ _PEAK_WIDTH = 0.7  # m
 _LEAST_DISTANCE = 1.5  # m between wheelsets
 _PROMINENCE = 0.7  # ln of energy, 3 dB
 
+_PULSE_CELLS = 60  # of :data:`travel.CELL`
+_BEAM = 1.2  # 1/m, sqrt^4(k/4EI) of a rail on fastenings of 40 to 100 kN/mm every 0.65 m
+_HUMP, _HUMP_FINE = 0.5, 0.2  # m, of the log-energy at a wheelset, and its smoothing
+_EXPLAINED = 0.9  # of a signal's variance, at which no other is needed
+_BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other
+_PARTNER = 3.6  # m, the other wheelset of a bogie, or of the next one
+_PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bogies are seen
+_LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
+_PLACE = 0.08  # m, of all pulses against their wheelsets
+
 
 @dataclass(frozen=True)
 class Blind:
@@ -34,11 +48,14 @@ class Blind:
         motion: motion past the reference point.
         speed: at mid-train (m/s), with standard deviation.
         times: wheelsets at the reference channel (s).
-        regular: 0 to 1, how well the peaks pair into bogies; a count with less than 0.8 is not
-            to be trusted.
+        time_sigma: their standard deviations (s).
+        regular: 0 to 1, probability that the number of wheelsets is right; a count with less than
+            0.8 is not to be trusted.
         direction: +1, -1, or 0 unknown.
-        correlation: of the envelopes of two channels; 0 with one channel.
+        correlation: of the energies of two channels; 0 with one channel.
+        travels: whether two channels show the same wheelsets one after the other.
         method: how the speed was obtained.
+        axle_method: how the wheelsets were.
         sensors: channels used, the reference first.
         x: position of the reference (m).
     """
@@ -48,10 +65,13 @@ class Blind:
     motion: Motion
     speed: tuple[float, float]
     times: Array
+    time_sigma: Array
     regular: float
     direction: int
     correlation: float
+    travels: bool
     method: str
+    axle_method: str = "energy peak"
 
     @property
     def spacings(self) -> Array:
@@ -129,7 +149,9 @@ def envelope_delay(
 
 
 def describe(
+    records: Sequence[Record],
     traces: Sequence[Trace],
+    within: tuple[float, float],
     interval: tuple[float, float],
     limits: tuple[float, float],
     guess: float | None = None,
@@ -137,84 +159,102 @@ def describe(
     """What one or two rail channels tell of a train that no catalogue type explains.
 
     Args:
-        traces: rail channels; the first is the reference, the farthest other one the second.
+        records: rail channels.
+        traces: of the same in the band that serves the pattern; the first is the reference.
+        within: the event (s).
         interval: first and last strong energy (s).
         limits: speeds (m/s).
         guess: speed of the nearest catalogue type (m/s), for one channel.
     """
-    reference = traces[0]
-    others = sorted(traces[1:], key=lambda t: -abs(t.x - reference.x))
-    if others and abs(others[0].x - reference.x) > 2.0:
-        found = envelope_delay(reference, others[0], interval, limits)
-        if found is not None and found[1] > 0.4:
-            blind = _two_channels(reference, others[0], interval, *found)
-            if blind is not None:
-                return blind
-    return _one_channel(reference, interval, limits, guess)
+    ordered = sorted(records, key=lambda r: r.channel.x)
+    if len(ordered) > 1:
+        blind = _two_channels(ordered[0], ordered[-1], within, limits)
+        if blind is not None:
+            return blind
+    return _one_channel(traces[0], interval, limits, guess)
+
+
+def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
+    """Waveforms, then log-energies per band, of both channels over distance; the first guess of a
+    wheelset's pulse in them."""
+    edges = pair.edges(found.motion, found.direction)
+    lag = np.arange(-_PULSE_CELLS, _PULSE_CELLS + 1) * travel.CELL
+    curve = _BEAM * np.abs(lag)
+    bending = np.exp(-curve) * (np.cos(curve) - np.sin(curve))
+    waves = [wave.cells(e) for wave, e in zip(pair.waves, edges, strict=True)]
+    first, second, pulse = (
+        travel.band_pass(x, travel.FINE, travel.BROAD) for x in (*waves, bending)
+    )
+    out = [(first, second, pulse)]
+    hump = travel.band_pass(np.exp(-0.5 * (lag / _HUMP) ** 2), _HUMP_FINE, travel.BROAD)
+    for two in zip(*pair.traces, strict=True):
+        first, second = (
+            travel.band_pass(_log_energy(t, e), _HUMP_FINE, travel.BROAD)
+            for t, e in zip(two, edges, strict=True)
+        )
+        out.append((first, second, hump))
+    return out
+
+
+def _log_energy(trace: Trace, edges: Array) -> Array:
+    return np.log(np.maximum(trace.mean(edges[:-1], edges[1:]), trace.noise))
 
 
 def _two_channels(
-    a: Trace, b: Trace, interval: tuple[float, float], delay: float, correlation: float
+    a: Record, b: Record, within: tuple[float, float], limits: tuple[float, float]
 ) -> Blind | None:
-    baseline = b.x - a.x
-    rough = abs(baseline / delay)
-    direction = 1 if delay * baseline > 0 else -1
-    first = peaks(a, rough, interval)
-    second = peaks(b, rough, (interval[0] + min(delay, 0), interval[1] + max(delay, 0)))
-    if first.size < 2 or second.size < 2:
-        return None
-    nearest = second[np.argmin(np.abs(second[None, :] - first[:, None] - delay), axis=1)]
-    lag = nearest - first
-    paired = np.abs(lag - delay) < max(0.9 / rough, 0.1 * abs(delay))
-    if paired.sum() < 3:
-        return None
-    middle = 0.5 * (first[paired] + nearest[paired])
-    distance = abs(baseline)
-    # local speeds: v(t) = v + a t, from the delay of every wheelset
-    local = distance / np.abs(lag[paired])
-    epoch = float(np.mean(middle))
-    spread = max(robust_scale(local - np.median(local), 1), 1e-3 * rough)
-    t = middle - epoch
-    weight = np.where(np.abs(local - np.median(local)) < 4 * spread, 1.0, 0.0) / spread**2
-    normal = np.array(
-        [
-            [weight.sum(), (weight * t).sum()],
-            [(weight * t).sum(), (weight * t * t).sum() + 1 / 0.6**2],
-        ]
+    pair = Pair(
+        (travel.deflection(a.window, within), travel.deflection(b.window, within)),
+        (a.traces(within), b.traces(within)),
+        b.channel.x - a.channel.x,
+        within,
     )
-    v, acceleration = np.linalg.solve(
-        normal, [float((weight * local).sum()), float((weight * t * local).sum())]
-    )
-    cov = np.linalg.inv(normal)
-    covariance = np.zeros((3, 3))
-    covariance[0, 0] = (0.3 / np.sqrt(paired.sum())) ** 2
-    covariance[1:, 1:] = cov
-    if v <= 0:
+    found = travel.search(pair, limits)
+    if found is None or not found.clear:
         return None
-    start = float(first[0])
-    offset = v * (start - epoch) + 0.5 * acceleration * (start - epoch) ** 2
-    motion = Motion(epoch, -offset, float(v), float(acceleration), covariance)
-    mid = 0.5 * (first[0] + first[-1])
-    speed = float(motion.speed_at(mid))
+    best: tuple[Wheelsets, Array, Array] | None = None
+    for first, second, pulse in _signals(pair, found):
+        sign = 1.0 if first @ second >= 0 else -1.0
+        wheelsets = find(0.5 * (first + sign * second), 0.5 * (first - sign * second), pulse)
+        if wheelsets is not None and (best is None or wheelsets.explained > best[0].explained):
+            best = (wheelsets, first, sign * second)
+        if best is not None and best[0].explained > _EXPLAINED:
+            break
+    if best is None:
+        return None
+    wheelsets, first, second = best
+    levels = np.stack([heights(first, wheelsets), heights(second, wheelsets)])
+    both = levels.min(axis=0) > _BOTH * np.abs(levels).max(axis=0)
+    motion = found.motion
+    start = float(pair.axis(motion, found.direction)[0]) + 0.5 * travel.CELL
+    times = motion.time_at(start + wheelsets.place)
+    middle = 0.5 * float(times[0] + times[-1])
+    speed = float(motion.speed_at(middle))
+    near = np.diff(wheelsets.place) < _PARTNER
+    paired = np.append(near, False) | np.append(False, near)
     return Blind(
-        sensors=(a.name, b.name),
-        x=a.x,
+        sensors=(a.channel.name, b.channel.name),
+        x=a.channel.x,
         motion=motion,
-        speed=(
-            speed,
-            float(
-                np.hypot(
-                    motion.speed_sigma(float(mid)),
-                    speed * 2**0.5 * HIGH_BAND_POSITION_SIGMA / distance,
-                )
-            ),
-        ),
-        times=first,
-        regular=regularity(first, speed),
-        direction=direction,
-        correlation=correlation,
+        speed=(speed, motion.speed_sigma(middle)),
+        times=times,
+        time_sigma=np.hypot(wheelsets.sigma, _PLACE) / motion.speed_at(times),
+        # bogies further apart than wheelsets are: one pulse for both wheelsets of a bogie
+        regular=wheelsets.certainty if paired.mean() > _PAIRED else min(wheelsets.certainty, 0.5),
+        direction=found.direction,
+        correlation=found.correlation[1],
+        travels=_is_train(wheelsets.place[both], paired[both]),
         method="delay between two rail channels",
+        axle_method="pulses common to two rail channels",
     )
+
+
+def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:
+    """Whether pulses that both channels show are a train: three bogies or more, as any two
+    disturbances have a delay that fits; in pairs, or many."""
+    bogies = 1 + int(np.sum(np.diff(places) > _PARTNER))
+    many = paired.sum() >= _LEAST_WHEELSETS or places.size >= 2 * _LEAST_WHEELSETS
+    return bogies >= _LEAST_BOGIES and bool(many)
 
 
 def _one_channel(
@@ -245,4 +285,16 @@ def _one_channel(
     epoch = float(times[0])
     covariance = np.diag([0.3**2, sigma**2, 0.6**2])
     motion = Motion(epoch, 0.0, speed, 0.0, covariance)
-    return Blind((trace.name,), trace.x, motion, (speed, sigma), times, score, 0, 0.0, method)
+    return Blind(
+        sensors=(trace.name,),
+        x=trace.x,
+        motion=motion,
+        speed=(speed, sigma),
+        times=times,
+        time_sigma=np.full(times.size, 0.4 / speed),
+        regular=score,
+        direction=0,
+        correlation=0.0,
+        travels=False,
+        method=method,
+    )

@@ -22,7 +22,8 @@ from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import Partial, departed, provisional
 from .onset import Trigger, quietest
-from .passage import Passage, Record, excited, find_passages
+from .passage import Passage, excited, find_passages
+from .record import Record
 from .response import find_response
 
 Array = NDArray[np.float64]

@@ -10,8 +10,9 @@ import numpy as np
 from .blind import envelope_delay
 from .head import Head, HeadMatcher
 from .kinematics import POSITION_SIGMA
-from .passage import Record, excited, strong_interval, traces_of
+from .passage import excited, strong_interval
 from .pattern import Trace
+from .record import Record
 
 LEAST_CORRELATION = 0.6
 AXLE_SPACING = 6.2
@@ -82,7 +83,7 @@ def _by_delay(
 ) -> Partial | None:
     best: Partial | None = None
     for first, second, (low, high) in zip(
-        traces_of(a, within), traces_of(b, within), a.window.bands, strict=False
+        a.traces(within), b.traces(within), a.window.bands, strict=False
     ):
         found = envelope_delay(first, second, within, limits)
         if found is None or found[1] < LEAST_CORRELATION:
@@ -118,7 +119,7 @@ def _by_pattern(
     record: Record, within: tuple[float, float], matcher: HeadMatcher
 ) -> Partial | None:
     best: Head | None = None
-    for trace, (low, high) in zip(traces_of(record, within), record.window.bands, strict=True):
+    for trace, (low, high) in zip(record.traces(within), record.window.bands, strict=True):
         interval = strong_interval(trace, high - low, within)
         head = interval and matcher.match(trace, interval[0], within[1])
         if head and (best is None or head.score > best.score):
@@ -175,7 +176,7 @@ def departed(
     best: tuple[Head, Record, tuple[float, float]] | None = None
     for record in rails:
         start = max(within[0], float(record.window.time[0]))
-        for trace, (low, high) in zip(traces_of(record, within), record.window.bands, strict=True):
+        for trace, (low, high) in zip(record.traces(within), record.window.bands, strict=True):
             interval = strong_interval(trace, high - low, within)
             if interval is None:
                 continue

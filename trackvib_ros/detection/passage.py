@@ -12,12 +12,11 @@ from .axles import AxleFit, fit_axles, refit
 from .blind import Blind, describe
 from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
-from .events import Channel
 from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN, Candidate, Explanation, explain
-from .features import Window
 from .kinematics import Motion, robust_scale
 from .pattern import Match, Trace, independent, refine, scan, stretched
 from .place import Wave
+from .record import Record
 
 Array = NDArray[np.float64]
 
@@ -35,8 +34,9 @@ SCATTERED_SCORE = 0.70
 """Least pattern correlation at which a type is named by the pattern of one channel alone. Two that
 show it in step are as significant at 0.535 (1 - r² is the root of that of one)."""
 
-CONFIRM_CORRELATION = 0.6
-"""Least correlation of the envelopes of two channels for a train of unknown type."""
+CLOCK_SCORE = 0.85
+"""Least pattern correlation at which a clock, and not an unlisted train, is held responsible for
+delays that no type explains: patterns of unlisted trains correlate with listed ones up to 0.83."""
 
 HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
@@ -53,15 +53,6 @@ _STRETCH = (
     1.25  # a delay that fits no type better than this is a clock's fault, not an unknown type
 )
 _STRETCH_STEP = 0.02  # 0.4 m of 20 m, within the smoothing of the scan
-
-
-@dataclass(frozen=True)
-class Record:
-    """What is known of one channel in an event: features and noise floor per band."""
-
-    channel: Channel
-    window: Window
-    floor: Array
 
 
 @dataclass(frozen=True)
@@ -144,34 +135,7 @@ class Passage:
         """Whether this is a train: by its pattern, or by what two channels agree on."""
         if self._patterned(CONFIRM_SCORE):
             return True
-        blind = self.blind
-        return (
-            blind is not None
-            and blind.direction != 0
-            and blind.correlation >= CONFIRM_CORRELATION
-            and blind.regular >= 0.7
-            and blind.times.size >= 8
-            and blind.speed[1] < 0.05 * blind.speed[0]
-        )
-
-
-def traces_of(record: Record, within: tuple[float, float], limited: bool = False) -> list[Trace]:
-    """One trace per band, quiet outside an interval (s)."""
-    window = record.window
-    return [
-        Trace(
-            record.channel.name,
-            record.channel.x,
-            window.time - window.shift[b],
-            window.energy[:, b],
-            window.valid,
-            float(record.floor[b]),
-            window.step,
-            (within[0] - 0.3, within[1] + 0.3),
-            limited,
-        )
-        for b in range(len(window.bands))
-    ]
+        return self.blind is not None and self.blind.travels
 
 
 def smoothed(trace: Trace, width_s: float) -> Array:
@@ -233,11 +197,11 @@ def _scan_channel(
     limits: tuple[float, float],
 ) -> _Scanned | None:
     found = []
-    whole = traces_of(record, within)
+    whole = record.traces(within)
     window = record.window
     wave = Wave(window.time - window.low_shift, window.low, window.valid)
     for trace, limited, band in zip(
-        whole, traces_of(record, within, limited=True), window.bands, strict=True
+        whole, record.traces(within, limited=True), window.bands, strict=True
     ):
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
@@ -378,13 +342,27 @@ def find_passage(
         passage = Passage(reference.interval, traces, reference.band, (), 0, coarse_score=top)
     else:
         passage = _fit_hypotheses(usable, trains, limits, site)
-    if passage.known:
+    off = bool(passage.clock_offset)
+    if passage.known and not (off and passage.score < CLOCK_SCORE):
         return passage
     guess = None
     if passage.hypotheses:
         best = passage.hypotheses[0]
         guess = float(best.fit.motion.speed_at(best.mid_time))
-    blind = describe([s.trace for s in scanned], scanned[0].interval, limits, guess)
+    shown = [s.trace for s in scanned]
+    blind = describe(records, shown, within, scanned[0].interval, limits, guess)
+    if blind is not None and blind.travels and off:
+        # an unlisted train is likelier than a pattern at either channel and a wrong clock
+        return replace(
+            passage,
+            hypotheses=(),
+            coarse_score=passage.score,
+            clock_offset=(),
+            quality=(),
+            blind=blind,
+        )
+    if passage.known:
+        return passage
     return replace(passage, blind=blind)
 
 

@@ -13,7 +13,8 @@ from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
 from .evidence import half_interval
 from .health import clipped
 from .live import Partial
-from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage, Record
+from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage
+from .record import Record
 from .response import CONFIRM_EVIDENCE, ResponsePassage
 
 Array = NDArray[np.float64]
@@ -187,7 +188,9 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
 
 
 def _prefer_blind(passage: Passage, blind: Blind) -> bool:
-    """Whether peaks tell more of an unknown train than the nearest pattern of the catalogue."""
+    """Whether pulses tell more of an unknown train than the nearest pattern of the catalogue."""
+    if blind.travels:
+        return True
     if not passage.hypotheses or passage.score < KNOWN_SCORE:
         return blind.direction != 0 or passage.score < CONFIRM_SCORE or blind.regular >= 0.9
     pattern = passage.hypotheses[0].places.size
@@ -477,18 +480,19 @@ def _unknown(
     def stamp(time: float) -> int:
         return origin_ns + round(time * 1e9)
 
-    time_sigma = float(np.hypot(0.4 / speed, _PULSE_SIGMA_S))
+    time_sigma = np.hypot(blind.time_sigma, _PULSE_SIGMA_S)
+    ends = {"departure": float(time_sigma[-1]), "passage": float(time_sigma[0])}
     events = [
         TrainEvent(
             kind="axle",
             stamp_ns=stamp(float(time)),
-            sigma_s=time_sigma,
+            sigma_s=float(sigma_s),
             confidence=0.9 * blind.regular,
-            method="energy peak",
+            method=blind.axle_method,
             sensors=blind.sensors[:1],
             values={"number": number},
         )
-        for number, time in enumerate(times, 1)
+        for number, (time, sigma_s) in enumerate(zip(times, time_sigma, strict=True), 1)
     ]
     spacings = blind.spacings
     span = float(spacings.sum())
@@ -499,10 +503,12 @@ def _unknown(
         "reference": blind.sensors[0],
         "reference_x": Estimate(blind.x, 0.0, "m"),
         "arrival_ns": stamp(float(times[0])),
-        "arrival_sigma": time_sigma,
+        "arrival_sigma": ends["passage"],
         "departure_ns": stamp(float(times[-1])),
-        "departure_sigma": time_sigma,
-        "passing_time": Estimate(duration, 2**0.5 * time_sigma, "s"),
+        "departure_sigma": ends["departure"],
+        "passing_time": Estimate(
+            duration, float(np.hypot(ends["passage"], ends["departure"])), "s"
+        ),
         "speed": Estimate(speed, sigma, "m/s"),
         "speed_at": "middle of the train at the reference point",
         "acceleration": acceleration,
@@ -525,7 +531,7 @@ def _unknown(
             TrainEvent(
                 kind=kind,  # type: ignore[arg-type]
                 stamp_ns=stamp(float(time)),
-                sigma_s=time_sigma,
+                sigma_s=ends[kind],
                 confidence=confidence,
                 method=blind.method,
                 sensors=blind.sensors,

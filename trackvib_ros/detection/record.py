@@ -1,0 +1,41 @@
+"""One channel in an event: its features, its noise, its energy traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .events import Channel
+from .features import Window
+from .pattern import Trace
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Record:
+    """What is known of one channel in an event: features and noise floor per band."""
+
+    channel: Channel
+    window: Window
+    floor: Array
+
+    def traces(self, within: tuple[float, float], limited: bool = False) -> list[Trace]:
+        """One trace per band, quiet outside an interval (s); levels ``limited`` on request."""
+        window = self.window
+        return [
+            Trace(
+                self.channel.name,
+                self.channel.x,
+                window.time - window.shift[b],
+                window.energy[:, b],
+                window.valid,
+                float(self.floor[b]),
+                window.step,
+                (within[0] - 0.3, within[1] + 0.3),
+                limited,
+            )
+            for b in range(len(window.bands))
+        ]
