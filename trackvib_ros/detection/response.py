@@ -27,7 +27,7 @@ from scipy import fft
 from .catalogue import TrainType
 from .events import Channel
 from .kinematics import PRIOR_ACCELERATION, Motion
-from .passage import Record
+from .record import Record
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
