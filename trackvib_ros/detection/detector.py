@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from heapq import heappop, heappush
 from itertools import pairwise
 
 import numpy as np
@@ -21,14 +22,14 @@ from .features import GroupStream
 from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import Partial, departed, provisional
-from .onset import Trigger, quietest
+from .onset import GAINS, WARM_UP, Onset, Trigger, quietest
 from .passage import Passage, excited, find_passages
 from .record import Record
 from .response import find_response
 
 Array = NDArray[np.float64]
 
-_LOOKAHEAD_NS = 30_000_000  # a short hole is closed by samples this far ahead
+_HOLE_NS = 30_000_000  # a short hole is closed by samples at most this far ahead
 _CHUNK_NS = 1_000_000_000
 _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
@@ -92,16 +93,20 @@ class DetectorConfig:
 class _Group:
     """One block group: its stream, its trigger, where its channels stand in the detector."""
 
-    def __init__(self, block: Waveform, index: list[int], keep_s: float) -> None:
+    def __init__(self, block: Waveform, index: list[int], keep_s: float, sharing: int) -> None:
         self.stream = GroupStream(block.channels, block.dt_ns, keep_s)
         self.index = index
         self.next_bin = 0
-        self.restarts = 0
         self.calm_s = 0.0
         self.trigger = self._trigger()
+        self.onset = Onset(len(index), len(self.stream.bands), self.stream.step, sharing)
+        self.watching = True
 
     def _trigger(self) -> Trigger:
-        return Trigger(len(self.index), self.stream.bands, self.stream.frame_s)
+        stream = self.stream
+        return Trigger(
+            len(self.index), stream.bands, stream.frame_s, stream.frame_bins * stream.freedom
+        )
 
     def quietest(self, until_ns: int) -> Array:
         """Noise floors by the quietest stretch up to a time, (channels, bands)."""
@@ -114,12 +119,37 @@ class _Group:
         self.next_bin = 0
         self.trigger = self._trigger()
         self.trigger.start_from(floor)
+        self.onset.restart()
+        self.watching = True
+
+    def rises(self, until_ns: int) -> tuple[Array | None, list[tuple[int, int, int]]]:
+        """The onset test in the next decision frame, as far as it goes.
+
+        Returns:
+            Statistic; time after the bin in which it crosses its threshold, channel of the group
+            and alternative.
+        """
+        ready = self.trigger.seen >= WARM_UP
+        if not self.watching or not ready.any():
+            return None, []
+        energy, valid, ends = self.stream.fresh(self.next_bin, until_ns)
+        if not len(ends):
+            return None, []
+        valid = valid & ready
+        with np.errstate(invalid="ignore"):
+            ratio = np.where(valid[..., None], energy / self.trigger.floor, 0.0)
+        statistic = self.onset.look(ratio, valid, self.stream.freedom * self.trigger.whiteness)
+        over = statistic.mean(axis=2) > self.onset.threshold
+        found = []
+        for local in np.flatnonzero(over.any(axis=0)):
+            at = int(np.argmax(over[:, local]))
+            found.append((int(ends[at]), int(local), int(np.argmax(statistic[at, local]))))
+        return statistic, found
 
 
 @dataclass
 class _Event:
     start_ns: int
-    triggered: set[int]
     last_ns: dict[int, int]
     strongest: dict[int, float]
     least: dict[int, float]
@@ -238,7 +268,8 @@ class TrainDetector:
                 raise InputError(
                     f"dt_ns = {block.dt_ns} ns must be positive and at most 20 000 000 ns (50 Hz)"
                 )
-            group = _Group(block, [self._index[n] for n in block.channels], self._keep_s)
+            index = [self._index[n] for n in block.channels]
+            group = _Group(block, index, self._keep_s, len(self.channels))
             self._groups[block.channels] = group
         if block.data.ndim != 2 or block.data.shape[1] != len(block.channels):
             raise InputError(
@@ -270,29 +301,43 @@ class TrainDetector:
         events: list[TrainEvent] = []
         while self._done_ns < horizon_ns:
             self._done_ns = min(self._done_ns + _CHUNK_NS, horizon_ns)
+            until = self._done_ns
             for group in self._groups.values():
                 group.stream.advance(self._done_ns)
-            events += self._frames(self._done_ns - _LOOKAHEAD_NS)
+                until = min(until, group.stream.resolved_ns(self._done_ns))
+            events += self._frames(max(until, self._done_ns - _HOLE_NS))
         return events
 
     def _frames(self, until_ns: int) -> list[TrainEvent]:
-        """Take the decision frames that end before a time, in order of time over all groups."""
-        ready = []
+        """Take bins and decision frames that end by a time, in order of time over all groups."""
+        queue: list[tuple[int, int, int, int, _Group, Array | None]] = []
+
+        def await_next(order: int, group: _Group) -> None:
+            statistic, rises = group.rises(until_ns)
+            for at_ns, local, best in rises:
+                heappush(queue, (at_ns, order, local, best, group, None))
+            if group.next_bin + group.stream.frame_bins <= group.stream.bins:
+                end_ns = group.stream.frame_end_ns(group.next_bin)
+                if end_ns <= until_ns:
+                    heappush(queue, (end_ns, order, len(group.index), 0, group, statistic))
+
         for order, group in enumerate(self._groups.values()):
-            while group.next_bin + group.stream.frame_bins <= group.stream.bins:
-                frame = group.stream.frame(group.next_bin)
-                if frame.end_ns > until_ns:
-                    break
-                group.next_bin += group.stream.frame_bins
-                ready.append((frame.end_ns, order, group, frame))
-        ready.sort(key=lambda item: item[:2])
+            await_next(order, group)
         events: list[TrainEvent] = []
-        for end_ns, _, group, frame in ready:
+        while queue:
+            now_ns, order, local, best, group, statistic = heappop(queue)
+            if local < len(group.index):
+                events += self._open(now_ns, group, local, best)
+                continue
+            frame = group.stream.frame(group.next_bin)
+            group.next_bin += group.stream.frame_bins
             in_event = self._event is not None
+            if statistic is not None:
+                group.onset.take(statistic)
             active = group.trigger.step(frame.energy, frame.valid & ~frame.still, frozen=in_event)
-            if end_ns > self._replayed_ns:
+            if now_ns > self._replayed_ns:
                 events += self._health.step(
-                    end_ns,
+                    now_ns,
                     group.stream.frame_s,
                     group.index,
                     frame.mean,
@@ -301,13 +346,17 @@ class TrainDetector:
                     frame.valid,
                     in_event,
                 )
-            events += self._decide(end_ns, group, active)
+            events += self._decide(now_ns, group, active)
             if self._beginning and self._event is None and self._calmed(group):
                 self._beginning = False
-                self._anew(end_ns)
+                self._anew(now_ns)
             if self._replay:
                 self._replay = False
                 return events + self._frames(until_ns)
+            if self._event is not None and group.watching:
+                group.onset.restart()
+            group.watching = self._event is None
+            await_next(order, group)
         return events
 
     def _calmed(self, group: _Group) -> bool:
@@ -338,22 +387,29 @@ class TrainDetector:
         self._lowest[:] = np.inf
         self._active_ns[:] = -(2**62)
 
+    def _open(self, now_ns: int, group: _Group, local: int, best: int) -> list[TrainEvent]:
+        """An event begins where energy rises, unless an earlier train rings on."""
+        channel = group.index[local]
+        if self._event is not None or not self._fresh(
+            channel, float(group.trigger.level[local]), now_ns
+        ):
+            return []
+        band, gain = divmod(best, len(GAINS))
+        start = now_ns - round((group.stream.step + group.stream.shift[band]) * 1e9)
+        self._event = _Event(start, {}, {}, {}, {})
+        self._event.next_update_ns = now_ns + _UPDATE_NS
+        return [report.arrival(self.channels[channel], start, GAINS[gain])]
+
     def _decide(self, now_ns: int, group: _Group, active: NDArray[np.bool_]) -> list[TrainEvent]:
         events: list[TrainEvent] = []
         for local in np.flatnonzero(active):
             channel = group.index[local]
             level = float(group.trigger.level[local])
-            if self._event is None and self._fresh(channel, level, now_ns):
-                delay = group.stream.shift[group.trigger.band[local]]
-                start = now_ns - round((group.stream.frame_s + delay) * 1e9)
-                self._event = _Event(start, set(), {}, {}, {}, {})
-                self._event.next_update_ns = now_ns + _UPDATE_NS
-                ratio = float(group.trigger.ratio[local])
-                events.append(report.arrival(self.channels[channel], start, ratio))
-            self._active_ns[channel] = now_ns
             if self._event is not None:
-                self._event.triggered.add(channel)
                 self._follow(self._event, channel, float(group.trigger.steady[local]), now_ns)
+            elif self._fresh(channel, level, now_ns):
+                continue  # not yet an onset
+            self._active_ns[channel] = now_ns
         if self._event is None:
             self._lowest[group.index] = np.minimum(
                 self._lowest[group.index], np.maximum(group.trigger.level, 1.0)

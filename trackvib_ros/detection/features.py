@@ -79,14 +79,12 @@ class Frame:
     """About 10 ms of a group, per channel: see :class:`Window`.
 
     Attributes:
-        end_ns: time after the frame.
         energy: shape (channels, bands).
         valid: mostly measured.
         still: not one sample differs from the one before.
         mean: of the raw samples.
     """
 
-    end_ns: int
     energy: Array
     valid: NDArray[np.bool_]
     still: NDArray[np.bool_]
@@ -107,6 +105,15 @@ def _dc_delay(sos: Array, rate: float) -> float:
     return float(np.sum(np.arange(response.size) * response) / np.sum(response) / rate)
 
 
+def _freedom(power: Array, width: float, time: float) -> float:
+    """Degrees of freedom of the energy of Gaussian noise over a time (s).
+
+    2 T (∫S df)² / ∫S² df for a power spectrum S sampled every ``width`` Hz (Blackman & Tukey, The
+    measurement of power spectra, 1958); 2 B T for a rectangular band of width B.
+    """
+    return float(2 * time * width * power.sum() ** 2 / np.sum(power**2))
+
+
 def _moving_high_pass(low: float, rate: float) -> Array:
     """Taps of "delayed minus moving mean": -3 dB near ``low`` (Hz), linear phase."""
     taps = 2 * max(1, round(0.3 * rate / low)) + 1
@@ -116,7 +123,15 @@ def _moving_high_pass(low: float, rate: float) -> Array:
 
 
 class GroupStream:
-    """Channels that share stamps and rate: raw samples in, features in a ring out."""
+    """Channels that share stamps and rate: raw samples in, features in a ring out.
+
+    Attributes:
+        step: length of a bin (s).
+        bands: frequency limits (Hz).
+        shift: group delay per band (s).
+        freedom: degrees of freedom of a bin's energy per band, white noise.
+        end_ns: time after the newest sample.
+    """
 
     def __init__(self, channels: tuple[str, ...], dt_ns: int, keep_s: float) -> None:
         self.channels = channels
@@ -128,6 +143,7 @@ class GroupStream:
         self.step = self.decimation / self.rate
         self.frame_bins = max(1, round(FRAME_S / self.step))
         self.frame_s = self.frame_bins * self.step
+        self._to_end_ns = dt_ns * (self.decimation - (self.decimation - 1) // 2)
         self.bands = bands_for(self.rate)
         top = min(_INNER_TOP, 0.45 * self.rate)
         self._front = signal.bessel(4, top, "low", norm="mag", fs=self.rate, output="sos")
@@ -140,6 +156,23 @@ class GroupStream:
         self.shift = np.array(
             [
                 front + _dc_delay(sos, inner) + (len(fir) // 2) / inner
+                for sos, fir in zip(self._sos, self._fir, strict=True)
+            ]
+        )
+        f = np.arange(0.25, 0.5 * inner, 0.5)
+        front_gain = signal.sosfreqz(self._front, f, fs=self.rate)[1]
+        self.freedom = np.array(
+            [
+                _freedom(
+                    np.abs(
+                        front_gain
+                        * signal.sosfreqz(sos, f, fs=inner)[1]
+                        * signal.freqz(fir, 1, f, fs=inner)[1]
+                    )
+                    ** 2,
+                    0.5,
+                    self.step,
+                )
                 for sos, fir in zip(self._sos, self._fir, strict=True)
             ]
         )
@@ -348,6 +381,12 @@ class GroupStream:
         """Bins made since the start of the stream."""
         return self.dropped_bins + self._fill
 
+    def frame_end_ns(self, first_bin: int) -> int:
+        """Time after a decision frame."""
+        return (
+            int(self._stamps[first_bin - self.dropped_bins + self.frame_bins - 1]) + self._to_end_ns
+        )
+
     def frame(self, first_bin: int) -> Frame:
         """What one decision frame holds."""
         start = first_bin - self.dropped_bins
@@ -355,7 +394,6 @@ class GroupStream:
         mean = part.mean(axis=0, dtype=np.float64)
         b = len(self.bands)
         return Frame(
-            end_ns=int(self._stamps[start + self.frame_bins - 1]) + round(self.step * 5e8),
             energy=mean[:, :b],
             valid=mean[:, b + 3] > 0.7,
             still=part[:, :, b + 2].min(axis=0) >= self.decimation,
@@ -375,6 +413,29 @@ class GroupStream:
         moving = part[:, :, b + 2].min(axis=1) < self.decimation
         usable = (part[:, :, b + 3].mean(axis=1) > 0.7) & moving & (energy > 0).all(axis=1)
         return np.asarray(energy[usable])
+
+    def fresh(
+        self, first_bin: int, until_ns: int
+    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
+        """Bins of a decision frame that is not complete yet, as far as they end by a time.
+
+        Returns:
+            Energies, shape (bins, channels, bands); whether measured (bins, channels); time after
+            every bin (ns).
+        """
+        start = first_bin - self.dropped_bins
+        stop = min(start + self.frame_bins, self._fill)
+        ends = self._stamps[start:stop] + self._to_end_ns
+        count = int(np.searchsorted(ends, until_ns, side="right"))
+        part = self._ring[start : start + count]
+        b = len(self.bands)
+        return part[:, :, :b].astype(np.float64), part[:, :, b + 3] > 0.5, ends[:count]
+
+    def resolved_ns(self, until_ns: int) -> int:
+        """Time up to which :meth:`advance` to a time made all bins: a short hole waits."""
+        made = self._pending_ns + self.decimation * self.dt_ns
+        waits = self._pending_count >= self.decimation and made <= until_ns
+        return self._pending_ns if waits else until_ns
 
     def window(self, channel: int, from_ns: int, to_ns: int) -> Window:
         """Features of one channel between two times, as far as the ring still holds them."""

@@ -1,9 +1,16 @@
-"""Causal energy trigger per channel: short-term energy against a noise floor that is learned.
+"""When energy rises (:class:`Onset`), and where it is above the noise (:class:`Trigger`).
 
-The short-term average over 1 to 16 frames is compared with the floor in every band. The
-thresholds follow from the chi-square law of the energy of band-limited Gaussian noise: 2 B T
-degrees of freedom in a band of width B over time T (Urkowitz, Proc. IEEE 55, 1967, 523). The floor
-is frozen while an event lasts.
+The onset is a sequential test, bin by bin of about 1 ms. With noise the energy E over floor F of a
+bin has ν degrees of freedom, with a train g times as much; the likelihood ratio of the bin is
+``g^(-ν/2) exp(ν/2 (1 - 1/g) E/F)``. The statistic of Shiryaev and Roberts sums the likelihood
+ratios over all times at which the train may have come, ``R_n = (1 + R_(n-1)) Λ_n``, and is averaged
+over what is not known: the band, and g. ``R_n - n`` is a martingale under noise for any such
+average, so the mean number of bins between false alarms is at least the threshold (Pollak, Ann.
+Statist. 13, 1985, 206, and 15, 1987, 749), and no test of that false alarm rate tells the change
+much sooner.
+
+Activity is the short-term average over 1 to 16 frames against a threshold from the chi-square law
+of the energy (Urkowitz, Proc. IEEE 55, 1967, 523). The floor is frozen while an event lasts.
 """
 
 from __future__ import annotations
@@ -18,18 +25,80 @@ WINDOWS = (1, 2, 4, 8, 16)
 """Lengths of the short-term averages (frames)."""
 
 _UPPER = 3 * WINDOWS[-1] // 4 - 1  # rank of the upper quartile of the longest window
+
+WARM_UP = 50
+"""Frames from which a floor is learned."""
+
 _FALSE_ALARM = 1e-9  # per test, Gaussian noise: 0.007 an hour and channel before the margin
 _MARGIN = 1.2  # the floor itself is an estimate
 _LEAST_RATIO = 1.6
-_WARM_UP = 50  # frames
 _FLOOR_FRAMES = 800.0  # time constant of the floor
 _FALL_FRAMES = 50.0  # faster downwards: a floor learned inside a train is wrong
 _QUIET_FRAMES = 8  # 80 ms: the least that a record leaves before its train
 _QUIET_RANGE = 4.0  # over the quietest, still the same noise: 6 dB
+_UNREST_FRAMES = 3200.0  # time constant of the variance of the longest window
+_UNREST_PRIOR = 160.0  # frames that its first estimate counts as
+_LAST = np.array(WINDOWS) - 1
+_COUNT = np.array(WINDOWS, dtype=np.float64)[:, None, None]
+
+
+GAINS = (2.5, 5.0, 10.0, 40.0)
+"""Energy over noise that the onset test looks for. The least one makes 1.5 times the floor, for
+however long, no onset: noise changes by as much."""
+
+_FALSE_ARRIVAL_S = 7 * 86400.0  # mean time between false arrivals of a detector, Gaussian noise
+_MOST = 1e30  # of the statistic, and per bin e^30: they stay finite
+
+
+class Onset:
+    """Sequential test of the channels of one group for energy that begins to rise.
+
+    Args:
+        channels: of the group.
+        bands: number of bands.
+        bin_s: length of a bin (s).
+        sharing: channels of the detector, which share the false alarms.
+    """
+
+    def __init__(self, channels: int, bands: int, bin_s: float, sharing: int) -> None:
+        self.threshold = sharing * _FALSE_ARRIVAL_S / bin_s
+        self._shape = (channels, bands * len(GAINS))
+        self._gain = np.array(GAINS)
+        self.restart()
+
+    def restart(self) -> None:
+        """Nothing has been seen."""
+        self._sum = np.zeros(self._shape)
+
+    def look(self, ratio: Array, valid: NDArray[np.bool_], freedom: Array) -> Array:
+        """The statistic after every bin for every alternative; :meth:`take` adopts the last.
+
+        Args:
+            ratio: energy over floor, shape (bins, channels, bands).
+            valid: bins that count, shape (bins, channels).
+            freedom: degrees of freedom of a bin, shape (channels, bands).
+
+        Returns:
+            Shape (bins, channels, bands * gains).
+        """
+        g = self._gain
+        half = 0.5 * freedom[:, :, None]
+        log = (half * (1 - 1 / g)) * ratio[..., None] - half * np.log(g)
+        log = np.where(valid[..., None, None], np.minimum(log, 30.0), 0.0)
+        product = np.exp(np.cumsum(log.reshape(len(ratio), *self._shape), axis=0))
+        # R_n = Λ_1 ... Λ_n (R_0 + Σ_k 1 / (Λ_1 ... Λ_(k-1)))
+        begun = np.empty_like(product)
+        begun[0] = 1.0 + self._sum
+        begun[1:] = 1.0 / product[:-1]
+        return np.asarray(product * np.cumsum(begun, axis=0))
+
+    def take(self, statistic: Array) -> None:
+        """Go on from the last bin of :meth:`look`."""
+        np.minimum(statistic[-1], _MOST, out=self._sum)
 
 
 def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
-    """Energy over floor at which to trigger, shape (windows, bands)."""
+    """Energy over floor of active frames, shape (windows, bands)."""
     table = np.empty((len(WINDOWS), len(bands)))
     for w, frames in enumerate(WINDOWS):
         for b, (low, high) in enumerate(bands):
@@ -68,41 +137,54 @@ def quietest(energy: Array, bands: tuple[tuple[float, float], ...], frame_s: flo
 class Trigger:
     """Noise floor and activity of the channels of one group, frame by frame.
 
+    Args:
+        channels: of the group.
+        bands: frequency limits (Hz).
+        frame_s: length of a frame (s).
+        freedom: degrees of freedom of the energy of white noise in a frame, per band.
+
     Attributes:
         floor: energy of the noise, (channels, bands).
-        ratio: energy over threshold, the largest of windows and bands, per channel.
-        band: the band of ``ratio``.
         first_floor: the floor as it was first learned.
         recent: mean energy over the longest window.
         level: energy of the longest window over the floor, the largest of the bands.
         steady: the same of its upper quartile of frames, which the blows of a wheel flat, a frame
             or two each, do not raise.
-        active: ``ratio`` > 1.
-        fall_db: by how much the floor has fallen since it was first learned.
+        active: energy over threshold in a window and band.
     """
 
     def __init__(
-        self, channels: int, bands: tuple[tuple[float, float], ...], frame_s: float
+        self,
+        channels: int,
+        bands: tuple[tuple[float, float], ...],
+        frame_s: float,
+        freedom: Array,
     ) -> None:
         self.thresholds = thresholds(bands, frame_s)
         shape = (channels, len(bands))
         self.floor = np.full(shape, np.nan)
-        self.ratio = np.zeros(channels)
         self.active = np.zeros(channels, dtype=bool)
         self.seen = np.zeros(channels, dtype=np.int64)
-        self.fall_db = np.zeros(channels)
         self.level = np.ones(channels)
         self.steady = np.ones(channels)
-        self.band = np.zeros(channels, dtype=np.int64)
         self._history = np.zeros((WINDOWS[-1], *shape))
-        self._filled = np.zeros(channels, dtype=np.int64)
         self.recent = np.full(shape, np.nan)
-        self._warm = np.full((_WARM_UP, *shape), np.nan)
+        self._warm = np.full((WARM_UP, *shape), np.nan)
+        self._median = stats.chi2.median(freedom) / freedom
+        self._unrest_white = 2 / (WINDOWS[-1] * freedom)
+        self._unrest = np.tile(self._unrest_white, (channels, 1))
         self.first_floor = np.full(shape, np.nan)
 
-    def ready(self) -> NDArray[np.bool_]:
-        """Which channels have learned a floor."""
-        return self.seen >= _WARM_UP
+    @property
+    def whiteness(self) -> Array:
+        """Degrees of freedom of the noise over those of white noise, (channels, bands).
+
+        From the variance of the longest window's mean, as far as it is more than by chance (twice
+        the standard deviation of a variance): narrow-band noise and gusts have fewer.
+        """
+        windows = np.minimum(_UNREST_PRIOR + self.seen, _UNREST_FRAMES) / WINDOWS[-1]
+        chance = 1 + 2 * np.sqrt(2 / windows[:, None])
+        return np.asarray(np.minimum(chance * self._unrest_white / self._unrest, 1.0))
 
     def step(self, energy: Array, valid: NDArray[np.bool_], frozen: bool) -> NDArray[np.bool_]:
         """Take one frame of energies (channels, bands); say which channels are active.
@@ -116,52 +198,68 @@ class Trigger:
         else:
             self._history[1:, usable] = self._history[:-1, usable]
             self._history[0, usable] = energy[usable]
-        self._filled[usable] += 1
-        learning = usable & (self.seen < _WARM_UP)
+        ready = self.seen >= WARM_UP
+        learning = usable & ~ready
         if learning.any():
             for c in np.flatnonzero(learning):
                 self._warm[self.seen[c], c] = energy[c]
-                self.seen[c] += 1
-                if self.seen[c] == _WARM_UP:
-                    self.floor[c] = np.median(self._warm[:, c], axis=0)
+                if self.seen[c] == WARM_UP - 1:
+                    self.floor[c] = np.median(self._warm[:, c], axis=0) / self._median
                     self.first_floor[c] = self.floor[c]
-        ready = self.seen >= _WARM_UP
+                    self._unrest[c] = self._first_unrest(self._warm[:, c])
+                    ready[c] = True
+            self.seen[learning] += 1
         if not ready.any():
             return self.active
+        total = np.cumsum(self._history, axis=0)[_LAST]
+        mean = total / (_COUNT * self.floor)
         with np.errstate(invalid="ignore"):
-            excess = np.zeros(len(ready))
-            for w, frames in enumerate(WINDOWS):
-                mean = self._history[:frames].mean(axis=0) / self.floor
-                relative = np.nan_to_num(mean / self.thresholds[w])
-                band = np.argmax(relative, axis=1)
-                peak = relative[np.arange(len(band)), band]
-                self.band = np.where(peak > excess, band, self.band)
-                np.maximum(excess, peak, out=excess)
-            self.level = np.nanmax(mean, axis=1, initial=0.0)
-            upper = np.partition(self._history, _UPPER, axis=0)[_UPPER] / self.floor
-            self.steady = np.nanmax(upper, axis=1, initial=0.0)
-            self.recent = mean * self.floor
-        self.ratio = np.where(usable & ready, excess, 0.0)
-        self.active = self.ratio > 1.0
+            above = (mean > self.thresholds[:, None]).any(axis=(0, 2))
+        longest = mean[-1]
+        self.level = np.nan_to_num(longest).max(axis=1, initial=0.0)
+        upper = np.partition(self._history, _UPPER, axis=0)[_UPPER] / self.floor
+        self.steady = np.nan_to_num(upper).max(axis=1, initial=0.0)
+        self.recent = longest * self.floor
+        self.active = usable & ready & above
         learn = usable & ready & ~self.active
         if not frozen and learn.any():
-            excess_energy = energy[learn] / self.floor[learn]
-            quiet = self._history[:, learn].mean(axis=0) / self.floor[learn]
-            weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, 1 / _FLOOR_FRAMES)
-            self.floor[learn] *= 1 + weight * (np.minimum(excess_energy, 4.0) - 1)
-            self.fall_db[learn] = np.max(
-                10 * np.log10(self.first_floor[learn] / self.floor[learn]), axis=1
-            )
+            self._learn(learn, energy, longest)
         return self.active
 
     def start_from(self, floor: Array) -> None:
         """Begin with known floors, (channels, bands); NaN where one has to be learned."""
         known = np.isfinite(floor).all(axis=1) & (floor > 0).all(axis=1)
         self.floor[known] = self.first_floor[known] = floor[known]
-        self.seen[known] = _WARM_UP
+        self.seen[known] = WARM_UP
+        self._history[:, known] = floor[known]
+
+    def _learn(self, channels: NDArray[np.bool_], energy: Array, longest: Array) -> None:
+        """Track floor and unrest."""
+        self.seen[channels] += 1
+        count = self.seen[channels, None]
+        quiet = longest[channels]
+        weight = np.where(quiet < 0.3, 1 / _FALL_FRAMES, 1 / _FLOOR_FRAMES)
+        excess = energy[channels] / self.floor[channels]
+        self.floor[channels] *= 1 + weight * (np.minimum(excess, 4.0) - 1)
+        # what rises may be a train that comes: only what falls tells how restless the noise is
+        square = 2 * np.minimum(quiet - 1, 0.0) ** 2
+        weight = 1.0 / np.minimum(_UNREST_PRIOR + count, _UNREST_FRAMES)
+        self._unrest[channels] += weight * (square - self._unrest[channels])
+
+    def _first_unrest(self, energy: Array) -> Array:
+        """Variance of the longest window's mean by that of frames and its neighbours' correlation.
+
+        As of a first-order process, whose mean varies by (1 + ρ) / (1 - ρ) more.
+        """
+        away = energy / energy.mean(axis=0) - 1
+        variance = np.mean(away**2, axis=0)
+        rho = np.clip(np.mean(away[1:] * away[:-1], axis=0) / variance, 0.0, 0.9)
+        seen = variance / WINDOWS[-1] * (1 + rho) / (1 - rho)
+        return np.asarray(np.maximum(seen, self._unrest_white))
 
     def relearn(self, channel: int) -> None:
         """Forget the floor of a channel."""
         self.seen[channel] = 0
         self.first_floor[channel] = np.nan
+        self._unrest[channel] = self._unrest_white
         self.active[channel] = False
