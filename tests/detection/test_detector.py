@@ -233,6 +233,26 @@ def test_two_trains_in_succession(gap):
         assert passage.values["speed"].value == pytest.approx(truth.mid_speed(), rel=4e-3)
 
 
+@pytest.mark.parametrize(("kmh", "gap"), [(160, 1.5), (240, 1.0), (330, 1.0)])
+def test_a_train_is_told_before_the_next_one_has_passed(kmh, gap):
+    """Closer than the quiet time that ends an event: the first one's pattern says that it is past.
+
+    The gaps are the distance of the sensors, the longest gap of wheelsets and some 10 m in which
+    the rail fades and rises, or more.
+    """
+    for seed, name in enumerate(("metro", "articulated", "locomotive_hauled")):
+        first = Passage(CATALOGUE[name].axles, kmh / 3.6)
+        end = first.axle_times(20.0)[-1]
+        second = Passage(CATALOGUE[name].axles, kmh / 3.6, start=end + gap, level=0.8)
+        detector, told = TrainDetector(RAILS), []
+        for block in blocks(record([first, second], RAILS, 20, seed=seed)):
+            told += [(block.end_ns * 1e-9, p) for p in passages(detector.process(block))]
+        assert [p.values["type"] for _, p in told] == [name, name]
+        assert told[0][0] < second.axle_times(20.0)[-1]
+        for (_, passage), truth in zip(told, (first, second), strict=True):
+            assert passage.values["speed"].value == pytest.approx(truth.mid_speed(), rel=4e-3)
+
+
 @pytest.mark.parametrize("kind", NUISANCES)
 def test_no_nuisance_is_a_train(kind):
     for seed in range(2):

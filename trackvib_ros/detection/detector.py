@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -39,6 +39,9 @@ _STRONG = 1 / 4  # of the strongest level: a wheelset is near
 _CREEP = 1.023  # by which the least level is forgotten a frame, 10 dB/s
 _RISEN = 1.6  # over the least level: another wheelset comes, 2 dB
 _HANG_LEAST_S, _HANG_FACTOR, _HANG_MORE_S = 1.0, 2.0, 0.5
+_LULL_NS = 250_000_000  # least quiet time after which a train may be past
+_LULL_FACTOR = 1.3  # over its longest lull so far
+_LULL_MARGIN = 1.15  # over the longest gap of wheelsets in the catalogue
 _HANG_LEARNT_NS = 1_000_000_000
 _UPDATE_NS = 200_000_000
 _UPDATE_GROWTH = 0.25  # of the time passed, between trials
@@ -156,13 +159,18 @@ class _Event:
     pause_ns: dict[int, int]
     next_update_ns: int = 0
     updates: int = 0
+    strong_ns: dict[int, int] = field(default_factory=dict)
+    lull_ns: dict[int, int] = field(default_factory=dict)
+    trial_ns: int = 0
+    past_ns: int | None = None
 
 
 class TrainDetector:
     """Detects trains in a stream of waveform blocks.
 
     Memory is bounded by the longest event (:attr:`DetectorConfig.max_event`); the final events of a
-    train come ``hang`` seconds after its last wheelset.
+    train come ``hang`` seconds after its last wheelset at the latest, those of a known type once no
+    wheelset of any type can follow.
 
     Args:
         channels: accelerometers, with positions.
@@ -424,6 +432,8 @@ class TrainDetector:
             for other in self._groups.values():
                 for row in range(len(other.index)):
                     other.trigger.relearn(row)
+        elif self._past(self._event, now_ns):
+            events += self._close(now_ns, max(self._strong(self._event).values()))
         elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
             events += self._update(self._event, now_ns)
         return events
@@ -436,12 +446,56 @@ class TrainDetector:
         strongest = max(level, event.strongest.get(channel, 0.0))
         least = min(level, _CREEP * event.least.get(channel, level))
         event.strongest[channel], event.least[channel] = strongest, least
+        if level > _STRONG * strongest:
+            lull = now_ns - event.strong_ns.get(channel, now_ns)
+            event.lull_ns[channel] = max(lull, event.lull_ns.get(channel, 0))
+            event.strong_ns[channel], event.past_ns = now_ns, None
         near = level > _STRONG * strongest or level > max(_FADED * strongest, _RISEN * least)
         if near or _FADED * strongest < 1:
             if channel in event.last_ns:
                 pause = now_ns - event.last_ns[channel]
                 event.pause_ns[channel] = max(pause, event.pause_ns.get(channel, 0))
             event.last_ns[channel] = now_ns
+
+    def _strong(self, event: _Event) -> dict[int, int]:
+        """When each rail channel was last strong."""
+        return {c: t for c, t in event.strong_ns.items() if self.channels[c].layer == "rail"}
+
+    def _past(self, event: _Event, now_ns: int) -> bool:
+        """Whether a train of a known type has passed whole, before the quiet time is over.
+
+        Its pattern explains all that was strong, and at its speed a further wheelset of any type
+        would have come by now. Another train may follow soon.
+        """
+        if event.past_ns is not None:
+            return now_ns >= event.past_ns
+        strong = self._strong(event)
+        if not strong or now_ns < event.trial_ns:
+            return False
+        latest = max(strong, key=lambda c: strong[c])
+        lull = now_ns - strong[latest]
+        if lull < max(_LULL_NS, _LULL_FACTOR * event.lull_ns[latest]):
+            return False
+        event.trial_ns = now_ns + lull // 2
+        origin = event.start_ns - _BEFORE_NS
+        end = (strong[latest] - origin) * 1e-9
+        within = ((event.start_ns - origin) * 1e-9 - 0.5, end)
+        found = self._find(self._rails(origin, now_ns), within)
+        if not found or not all(passage.known and passage.confirmed for passage in found):
+            return False
+        best, traces = found[-1].hypotheses[0], found[-1].traces
+        way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
+        last = float(best.fit.motion.time_at(best.places[-1] + way))
+        clear = _LULL_MARGIN * self._longest_gap / float(best.fit.motion.speed_at(last))
+        if not last - clear < end < last + clear:
+            return False
+        event.past_ns = max(now_ns, origin + round((last + clear) * 1e9))
+        return now_ns >= event.past_ns
+
+    @cached_property
+    def _longest_gap(self) -> float:
+        """Between wheelsets of any type (m)."""
+        return max(float(np.max(np.diff(train.axles))) for train in self.catalogue)
 
     def _hang_ns(self, event: _Event, now_ns: int) -> int:
         """Quiet time that ends an event: a multiple of the longest pause that it had so far."""
@@ -466,7 +520,7 @@ class TrainDetector:
                 return max(times)
         return event.start_ns
 
-    def _close(self, now_ns: int) -> list[TrainEvent]:
+    def _close(self, now_ns: int, last_ns: int | None = None) -> list[TrainEvent]:
         event = self._event
         assert event is not None
         self._event = None
@@ -478,7 +532,7 @@ class TrainDetector:
         self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
         records = self._records(origin, now_ns)
-        last = self._deciding_last(event)
+        last = self._deciding_last(event) if last_ns is None else last_ns
         within = (
             (event.start_ns - origin) * 1e-9 - 0.5,
             (last - origin) * 1e-9 + 0.3,
