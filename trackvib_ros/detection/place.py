@@ -38,7 +38,7 @@ _SHIFTS = np.arange(-_REACH, _REACH + 0.01, 0.02)
 _SAMPLES = 2.5  # per wavelength at least
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
-DEFLECTION_SIGMA = 0.02
+DEFLECTION_SIGMA = 0.015
 """What remains in doubt of a place found in this way (m): damped pads make the deflection lag, and
 that lag is hardly told from the lead of the coupling (rms 0.010 to 0.019 m on computed passages at
 40 dB, 43 to 380 km/h)."""

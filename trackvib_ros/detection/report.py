@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 _DIRECTION = {1: "forward", -1: "backward", 0: "unknown"}
 _UNITS = {1: "single", 2: "double"}
 _GEOMETRY = 0.03  # m, wheelsets of a train against its type
+_WHEELBASE = 0.1  # m, half of what wheelbases differ by: that of an unknown type is not measured
 _PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
 _MARGIN_S = 0.15  # of a record about the strong energy of a train that is wholly on it
 _MARGIN = 0.5  # m, the same about its wheelsets if these are known
@@ -263,6 +264,8 @@ def _train(
         late = fit.time[0] - predicted
     axle_times = predicted + np.where(fit.used[0], trust * late, 0.0)
     scatter = float(np.sqrt(trust) * fit.scale)
+    # under an unknown type: where its pulse is, whatever the size of the train
+    direct = float(np.sqrt(fit.place_sigma[0] ** 2 + fit.scale**2 + _WHEELBASE**2))
     events: list[TrainEvent] = []
     reference = passage.traces[0]
     confidences = []
@@ -270,6 +273,10 @@ def _train(
         seen = bool(fit.used[0, i])
         time = float(axle_times[i])
         speed_here = max(float(motion.speed_at(time)), 0.5)
+        if passage.known or not seen:
+            time_sigma = float(np.hypot(motion.time_sigma(time), scatter / speed_here))
+        else:
+            time_sigma = direct / speed_here
         clear = 1 / (1 + np.exp(-3 * (float(fit.contrast[0, i]) - 0.5)))
         confidence = best.score * (clear if seen else 0.3)
         confidences.append(confidence)
@@ -277,11 +284,7 @@ def _train(
             TrainEvent(
                 kind="axle",
                 stamp_ns=stamp(time),
-                sigma_s=float(
-                    np.hypot(
-                        motion.time_sigma(time), np.hypot(scatter / speed_here, _PULSE_SIGMA_S)
-                    )
-                ),
+                sigma_s=time_sigma,
                 confidence=float(np.clip(confidence, 0.01, 0.99)),
                 method="pulse shift by maximum likelihood" if seen else "predicted by the motion",
                 sensors=(reference.name,),
@@ -291,14 +294,14 @@ def _train(
     known = passage.known
     speed, own, sigma, interval = _speed(passage)
     first, last = float(motion.time_at(places[0])), float(motion.time_at(places[-1]))
+    first_sigma, last_sigma = motion.time_sigma(first), motion.time_sigma(last)
     if not known:
         quality = [*quality, "unknown_type"]
-        first, last = (
-            float(fit.time[0, i]) if fit.observed[0, i] else t for i, t in ((0, first), (-1, last))
-        )
-    first_sigma = float(np.hypot(motion.time_sigma(first), _PULSE_SIGMA_S))
-    last_sigma = float(np.hypot(motion.time_sigma(last), _PULSE_SIGMA_S))
-    passing_sigma = float(np.hypot(2**0.5 * fit.scale / speed, _PULSE_SIGMA_S))
+        if fit.observed[0, 0]:
+            first, first_sigma = float(fit.time[0, 0]), direct / speed
+        if fit.observed[0, -1]:
+            last, last_sigma = float(fit.time[0, -1]), direct / speed
+    passing_sigma = 2**0.5 * fit.scale / speed
     values: dict[str, Value] = {
         "grade": CONFIRMED,
         "reference": reference.name,
