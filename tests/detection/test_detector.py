@@ -177,7 +177,9 @@ def test_clipping_at_a_fifth_of_the_peak():
     (passage,) = passages(run(signals, RAILS))
     assert "clipped" in passage.quality
     assert passage.values["axle_count"] == 32
-    assert passage.values["speed"].value == pytest.approx(60.0, rel=4e-3)
+    # bursts without a deflection: CRH2, 0.9 % larger, may not be told from CRH3
+    speed = passage.values["speed"]
+    assert abs(speed.value - 60.0) < 2.2 * speed.sigma < 2.2 * 60.0 * 0.009
 
 
 def flat_blows(passage, channel, time, rate, wheelsets, amplitude):

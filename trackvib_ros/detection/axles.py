@@ -16,7 +16,7 @@ from scipy import signal
 
 from .kinematics import Fit, Motion, regress
 from .pattern import Trace
-from .place import Wave, likelihood, locate
+from .place import CLIPPED_SIGMA, Wave, likelihood, locate
 
 Array = NDArray[np.float64]
 
@@ -282,6 +282,7 @@ def fit_axles(
             late = float(np.median(((time[k] - due[k]) * pace[k])[seen]))
             tables.append(likelihood(waves[k], motion, places[k] + late))
         more, place_sigma = locate(tables, scales)
+        place_sigma[[wave.clipped for wave in waves]] += CLIPPED_SIGMA
         time += more[:, None] / pace
         fit = regress(time[observed], np.stack(list(places))[observed], channel, motion.epoch)
         residual[observed] = fit.residual

@@ -13,6 +13,7 @@ from .blind import Blind, describe
 from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
 from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN, Candidate, Explanation, explain
+from .health import clipped
 from .kinematics import Motion, robust_scale
 from .pattern import Match, Trace, independent, refine, scan, stretched
 from .place import Wave
@@ -199,7 +200,8 @@ def _scan_channel(
     found = []
     whole = record.traces(within)
     window = record.window
-    wave = Wave(window.time - window.low_shift, window.low, window.valid)
+    inside = (window.time >= within[0]) & (window.time <= within[1])
+    wave = Wave(window.time - window.low_shift, window.low, window.valid, clipped(window, inside))
     for trace, limited, band in zip(
         whole, record.traces(within, limited=True), window.bands, strict=True
     ):
