@@ -545,7 +545,9 @@ class TrainDetector:
                 return part
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
             away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
-            train = find_response(away, within, self.catalogue.types, self._limits)
+            # strong first cars end an event on a bridge early; what rings on does no harm
+            span = (within[0], (now_ns - origin) * 1e-9)
+            train = find_response(away, span, self.catalogue.types, self._limits)
             if train is not None and train.confirmed:
                 return report.response(self.catalogue, records, origin, train)
         if records and not any(passage.confirmed for passage in found):
