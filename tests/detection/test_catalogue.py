@@ -76,3 +76,8 @@ def test_from_arrays():
     assert own["mine"].axle_positions == pytest.approx((0, 2.5, 17.4))
     with pytest.raises(InputError, match="not in the catalogue; it has mine"):
         own["yours"]
+
+
+def test_longest_gap_of_wheelsets():
+    own = Catalogue.from_axles({"short": [0.0, 2.5, 9.0, 11.5], "wagons": [0.0, 12.25, 13.0]})
+    assert own.longest_gap == 12.25

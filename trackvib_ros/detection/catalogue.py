@@ -105,6 +105,11 @@ class Catalogue:
             raise InputError(f"train names must differ; used more than once: {', '.join(twice)}")
         object.__setattr__(self, "_names", names)
 
+    @property
+    def longest_gap(self) -> float:
+        """Longest distance between successive wheelsets of a train of any type (m)."""
+        return max(float(np.max(np.diff(train.axles))) for train in self.types)
+
     def __iter__(self) -> Iterator[TrainType]:
         """Iterate over the types."""
         return iter(self.types)

@@ -486,16 +486,11 @@ class TrainDetector:
         best, traces = found[-1].hypotheses[0], found[-1].traces
         way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
         last = float(best.fit.motion.time_at(best.places[-1] + way))
-        clear = _LULL_MARGIN * self._longest_gap / float(best.fit.motion.speed_at(last))
+        clear = _LULL_MARGIN * self.catalogue.longest_gap / float(best.fit.motion.speed_at(last))
         if not last - clear < end < last + clear:
             return False
         event.past_ns = max(now_ns, origin + round((last + clear) * 1e9))
         return now_ns >= event.past_ns
-
-    @cached_property
-    def _longest_gap(self) -> float:
-        """Between wheelsets of any type (m)."""
-        return max(float(np.max(np.diff(train.axles))) for train in self.catalogue)
 
     def _hang_ns(self, event: _Event, now_ns: int) -> int:
         """Quiet time that ends an event: a multiple of the longest pause that it had so far."""

@@ -603,6 +603,16 @@ def find_passages(
     return _divided(rails, within, whole, catalogue, limits, site, depth=3)
 
 
+def apart(first: Passage, second: Passage) -> float:
+    """Distance (m) of the first wheelset of a train behind the last one of the train before it."""
+    end, start, speed = first.interval[1], second.interval[0], np.inf
+    if first.hypotheses and second.hypotheses:
+        best, after = first.hypotheses[0], second.hypotheses[0].fit.motion
+        end = float(best.fit.motion.time_at(best.places[-1]))
+        start, speed = float(after.time_at(0.0)), float(best.fit.motion.speed_at(end))
+    return (start - end) * speed
+
+
 def _divided(
     rails: Sequence[Record],
     within: tuple[float, float],
@@ -625,7 +635,8 @@ def _divided(
             if part is None or not part.confirmed:
                 break
             parts.append(part)
-        if len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1:
+        better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1
+        if better and apart(parts[0], parts[1]) > catalogue.longest_gap:
             return [
                 found
                 for half, part in zip(halves, parts, strict=True)
