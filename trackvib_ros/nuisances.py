@@ -146,6 +146,28 @@ def _neighbour(s: _Scene) -> None:
     s.data += envelope / envelope.max() * s.band(8, 80)
 
 
+def _noise(_: _Scene) -> None:
+    """Nothing but the noise that every recording has."""
+
+
+def _faults(s: _Scene) -> None:
+    """A bad sensor or cable: steps, drop-outs, a loose contact, drift."""
+    channel = int(s.random.integers(s.x.size))
+    data = s.data[:, channel]
+    for _ in range(int(s.random.integers(1, 6))):
+        first, last = sorted(s.random.integers(10 * RATE, len(data) - 5 * RATE, 2))
+        fault = s.random.integers(4)
+        if fault == 0:  # the mean jumps
+            data[first:] += s.random.uniform(-30, 30)
+        elif fault == 1:  # blocks are lost
+            data[first : first + int(s.random.uniform(0.02, 3.0) * RATE)] = np.nan
+        elif fault == 2:  # contact comes and goes
+            at = first + np.cumsum(s.random.exponential(0.05 * RATE, 60).astype(int) + 1)
+            data[at[at < last]] += s.random.normal(0, 10, int(np.sum(at < last)))
+        else:  # the zero wanders
+            data[first:last] += np.cumsum(s.random.standard_normal(last - first)) / 30
+
+
 KINDS: dict[str, Callable[[_Scene], None]] = {
     "hammer": _hammer,
     "road": _road,
@@ -155,12 +177,16 @@ KINDS: dict[str, Callable[[_Scene], None]] = {
     "spikes": _spikes,
     "hum": _hum,
     "neighbour": _neighbour,
+    "noise": _noise,
+    "faults": _faults,
 }
 """Disturbances by name."""
 
 
 def nuisance(kind: str, seed: int, channels: Sequence[Channel] = CHANNELS) -> Array:
     """One recording of :data:`STRETCH_S`, shape (samples, channels), noise of rms 1 included.
+
+    Samples that a fault has dropped are NaN.
 
     The disturbance has 1.6 to 100 times the rms of the noise.
     """

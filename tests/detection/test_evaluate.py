@@ -269,12 +269,15 @@ def test_scores_are_grouped_by_a_factor():
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_disturbance_stands_out_of_the_noise(kind):
     x = nuisance(kind, 11)
-    assert x.shape == (120_000, len(CHANNELS)) and np.isfinite(x).all()
+    assert x.shape == (120_000, len(CHANNELS))
+    # only a fault drops samples, and not of both channels
+    assert np.isfinite(x).all() or (kind == "faults" and np.isfinite(x).all(axis=0).any())
     # 8 s of undisturbed noise of rms 1 come first, but for passing vehicles and spikes
     if kind not in ("road", "spikes", "trolley", "neighbour"):
         assert x[:16_000].std() == pytest.approx(1.0, abs=0.03)
     # of 240,000 samples of the noise alone the largest is about 4.7
-    assert max(np.abs(nuisance(kind, seed)).max() for seed in range(3)) > 7
+    largest = max(np.nanmax(np.abs(nuisance(kind, seed))) for seed in range(3))
+    assert largest < 6 if kind == "noise" else largest > 7
     np.testing.assert_array_equal(x, nuisance(kind, 11))
     assert not np.array_equal(x, nuisance(kind, 12))
 
