@@ -10,6 +10,7 @@ from tests.detection.field_like import SEEDS, StandIn, catalogue, stand_in
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, TrainDetector, detect
 from trackvib_ros.detection.features import bands_for
 from trackvib_ros.detection.onset import quietest
+from trackvib_ros.nuisances import RATE, nuisance
 from trackvib_ros.waveform import Waveform
 
 RAIL = Channel("a", 0.0, "rail")
@@ -149,3 +150,12 @@ def test_nothing_finite_is_an_error(samples, rate):
 def test_mistakes_in_arrays_are_named(clock, samples, named):
     with pytest.raises(InputError, match=named):
         detect(clock, samples, RAIL)
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("spikes", 5_000_021), ("rain", 5_000_020)])
+def test_chance_is_no_short_train(kind, seed):
+    # on one rail these have the correlation of a railcar with three or four bogies (0.71)
+    short = Catalogue(tuple(t for t in catalogue() if t.name in ("class_642", "class_425")))
+    x = nuisance(kind, seed)[:, 0]
+    events = detect(RATE, x, RAIL, short)
+    assert of(events, "arrival") and not of(events, "passage")

@@ -39,6 +39,13 @@ CLOCK_SCORE = 0.85
 """Least pattern correlation at which a clock, and not an unlisted train, is held responsible for
 delays that no type explains: patterns of unlisted trains correlate with listed ones up to 0.83."""
 
+SEEN = 0.5
+"""ln of energy (2 dB) by which a wheelset that is seen rises over what is beside it."""
+
+LEAST_SEEN = 8
+"""Wheelsets of a pattern (two cars) to be seen on one channel, all where a train has fewer: three
+blows of a hammer in the right places have the correlation of a railcar on three bogies."""
+
 HOPELESS_SCORE = 0.40
 """Coarse correlation below which no pattern is worth refining."""
 
@@ -127,7 +134,11 @@ class Passage:
         """Whether a type's pattern is seen with this correlation, or clearly without wheelsets."""
         if not self.hypotheses:
             return False
-        scattered = self.hypotheses[0].fit.scale > SCATTERED
+        fit = self.hypotheses[0].fit
+        seen = np.sum(fit.observed & (fit.contrast > SEEN), axis=1)
+        if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))):
+            return False
+        scattered = fit.scale > SCATTERED
         alone = self.direction == 0
         return self.score >= (SCATTERED_SCORE if scattered and alone else least)
 
