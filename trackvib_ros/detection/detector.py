@@ -50,6 +50,7 @@ _UPDATE_WHEELSETS = (4, 12)  # by pattern, on one channel
 _UPDATE_WITHIN = 100.0  # m at the lowest speed: what is not clear by then is no train
 _BEGUN = 1.6  # energy of the first half second over the quietest: a train was near, 2 dB
 _AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
+_CLEAR = 0.8  # correlation of a whole train; the first half of one is like a short type by 0.65
 _JITTER = 3.0  # times the median deviation of a step, which rounding of the times reaches
 _AHEAD = 1.0  # m before a first wheelset that is on record
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
@@ -481,7 +482,7 @@ class TrainDetector:
         end = (strong[latest] - origin) * 1e-9
         within = ((event.start_ns - origin) * 1e-9 - 0.5, end)
         found = self._find(self._rails(origin, now_ns), within)
-        if not found or not all(passage.known and passage.confirmed for passage in found):
+        if not found or not all(p.known and p.confirmed and p.score > _CLEAR for p in found):
             return False
         best, traces = found[-1].hypotheses[0], found[-1].traces
         way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
