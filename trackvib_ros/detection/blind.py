@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,15 @@ from scipy import signal
 from . import travel
 from .kinematics import Motion
 from .pattern import Trace
+from .place import Wave, likelihood, locate
 from .record import Record
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
 Array = NDArray[np.float64]
+
+CONFIDENT = 0.8
+"""Least probability of a number of wheelsets that is told without reserve."""
 
 TYPICAL_WHEELBASE = 2.6
 """Middle of the wheelbases of catalogue bogies (2.2 to 3.0 m)."""
@@ -37,7 +41,7 @@ _BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at 
 _PARTNER = 3.6  # m, the other wheelset of a bogie, or of the next one
 _PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bogies are seen
 _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
-_PLACE = 0.08  # m, of all pulses against their wheelsets
+_PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,14 @@ class Blind:
         speed: at mid-train (m/s), with standard deviation.
         times: wheelsets at the reference channel (s).
         time_sigma: their standard deviations (s).
-        regular: 0 to 1, probability that the number of wheelsets is right; a count with less than
-            0.8 is not to be trusted.
+        regular: 0 to 1, probability that the number of wheelsets is right; with less than
+            :data:`CONFIDENT` the count is not to be trusted.
         direction: +1, -1, or 0 unknown.
         correlation: of the energies of two channels; 0 with one channel.
         travels: whether two channels show the same wheelsets one after the other.
         method: how the speed was obtained.
         axle_method: how the wheelsets were.
+        spacing_sigma: of the distance between successive wheelsets (m), the speed apart.
         sensors: channels used, the reference first.
         x: position of the reference (m).
     """
@@ -72,6 +77,7 @@ class Blind:
     travels: bool
     method: str
     axle_method: str = "energy peak"
+    spacing_sigma: float = 0.3
 
     @property
     def spacings(self) -> Array:
@@ -170,8 +176,16 @@ def describe(
     if len(ordered) > 1:
         blind = _two_channels(ordered[0], ordered[-1], within, limits)
         if blind is not None:
-            return blind
+            return blind if blind.regular >= CONFIDENT else _wary(blind, interval)
     return _one_channel(traces[0], interval, limits, guess)
+
+
+def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
+    """With the doubt that wheelsets before the first or after the last one were missed."""
+    sigma = blind.time_sigma.copy()
+    sigma[0] = np.hypot(sigma[0], max(float(blind.times[0]) - interval[0], 0.0))
+    sigma[-1] = np.hypot(sigma[-1], max(interval[1] - float(blind.times[-1]), 0.0))
+    return replace(blind, time_sigma=sigma)
 
 
 def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
@@ -225,9 +239,9 @@ def _two_channels(
     wheelsets, first, second = best
     levels = np.stack([heights(first, wheelsets), heights(second, wheelsets)])
     both = levels.min(axis=0) > _BOTH * np.abs(levels).max(axis=0)
-    motion = found.motion
-    start = float(pair.axis(motion, found.direction)[0]) + 0.5 * travel.CELL
-    times = motion.time_at(start + wheelsets.place)
+    start = float(pair.axis(found.motion, found.direction)[0]) + 0.5 * travel.CELL
+    motion, places, place_sigma = _placed(a, b, found, start + wheelsets.place)
+    times = motion.time_at(places)
     middle = 0.5 * float(times[0] + times[-1])
     speed = float(motion.speed_at(middle))
     near = np.diff(wheelsets.place) < _PARTNER
@@ -238,7 +252,7 @@ def _two_channels(
         motion=motion,
         speed=(speed, motion.speed_sigma(middle)),
         times=times,
-        time_sigma=np.hypot(wheelsets.sigma, _PLACE) / motion.speed_at(times),
+        time_sigma=np.hypot(wheelsets.sigma, place_sigma) / motion.speed_at(times),
         # bogies further apart than wheelsets are: one pulse for both wheelsets of a bogie
         regular=wheelsets.certainty if paired.mean() > _PAIRED else min(wheelsets.certainty, 0.5),
         direction=found.direction,
@@ -246,7 +260,38 @@ def _two_channels(
         travels=_is_train(wheelsets.place[both], paired[both]),
         method="delay between two rail channels",
         axle_method="pulses common to two rail channels",
+        spacing_sigma=float(2**0.5 * np.median(wheelsets.sigma)),
     )
+
+
+def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion, Array, float]:
+    """Motion, places of the wheelsets at the first channel and their common sigma (m), by the
+    deflection that all wheelsets carry, added in phase at either channel."""
+    baseline = b.channel.x - a.channel.x
+    motion, way = found.motion, found.direction
+    tables = [
+        likelihood(
+            Wave(r.window.time - r.window.low_shift, r.window.low, r.window.valid),
+            motion,
+            places + ahead,
+        )
+        for r, ahead in ((a, 0.0), (b, way * baseline))
+    ]
+    shift, sigma = locate(tables, np.full(2, _PLACE))
+    relative = float(np.hypot(*sigma)) / baseline
+    if relative * motion.speed < motion.covariance[1, 1] ** 0.5:
+        factor = baseline / (baseline + way * float(shift[1] - shift[0]))
+        covariance = motion.covariance.copy()
+        covariance[1, 1] = (relative * motion.speed) ** 2
+        motion = Motion(
+            motion.epoch,
+            0.0,
+            motion.speed * factor,
+            motion.acceleration * factor,
+            covariance,
+        )
+        return motion, (places + shift[0]) * factor, float(sigma[0])
+    return motion, places + shift[0], float(sigma[0])
 
 
 def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:

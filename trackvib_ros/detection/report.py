@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .blind import Blind
+from .blind import CONFIDENT, Blind
 from .catalogue import Catalogue
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
 from .evidence import half_interval
@@ -473,7 +473,7 @@ def _unknown(
 ) -> list[TrainEvent]:
     """A train that no type explains: what was seen, and no more."""
     quality = (*quality, "unknown_type")
-    if blind.regular < 0.8:
+    if blind.regular < CONFIDENT:
         quality = (*quality, "axle_count_not_confident")
     speed, sigma = blind.speed
     times = blind.times
@@ -524,7 +524,7 @@ def _unknown(
         "units": "unknown",
         "train_length": Estimate(span, float(np.hypot(span * sigma / speed, 0.5)), "m"),
         "axle_spacings": tuple(round(float(gap), 2) for gap in spacings),
-        "axle_spacing_sigma": round(float(np.hypot(0.3, 2.5 * sigma / speed)), 3),
+        "axle_spacing_sigma": round(float(np.hypot(blind.spacing_sigma, 2.5 * sigma / speed)), 3),
         "score": round(passage.score, 4),
         "correlation": round(blind.correlation, 4),
         "catalogue": catalogue.version,
