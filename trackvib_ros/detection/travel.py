@@ -303,16 +303,19 @@ def _features_under(pair: Pair, motion: Motion, direction: int) -> list[tuple[Ar
     return _features(pair, pair.edges(motion, direction), FINE)
 
 
-def _independent(x: Array) -> float:
+def _independent(x: Array, uneven: bool = True) -> float:
     """Independent samples in a series, by its autocorrelation: N / sum r(k)²
 
     (Bartlett's formula for the variance of a correlation; Box & Jenkins, Time Series Analysis,
-    sec. 11.1.3).
+    sec. 11.1.3), less if few of them carry its energy, when ``uneven``: 3 / kurtosis.
     """
     size = int(fft.next_fast_len(2 * x.size, real=True))
     r = fft.irfft(np.abs(fft.rfft(x, size)) ** 2, size)
     r = r / max(float(r[0]), 1e-300)
-    return max(x.size / max(float(r @ r), 1.0), 4.0)
+    square = x * x
+    kurtosis = x.size * float(square @ square) / max(float(square.sum()) ** 2, 1e-300)
+    share = 3.0 / max(kurtosis, 3.0) if uneven else 1.0
+    return max(share * x.size / max(float(r @ r), 1.0), 4.0)
 
 
 def _correlation(a: Array, b: Array) -> float:
@@ -386,6 +389,7 @@ def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> 
     start = min(grid, key=cost)
     left = [_residual(a, b) for a, b, _ in _features_under(pair, motion_at(start), direction)]
     weights = _Weights(_independent(left[0]), _independent(left[1]))
+    even = _Weights(_independent(left[0], uneven=False), _independent(left[1], uneven=False))
     simplex = start + np.array([[0.0, 0.0], [1.5, 0.0], [0.0, 1.5]])
     found = optimize.minimize(
         cost,
@@ -411,7 +415,7 @@ def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> 
     return Travel(
         Motion(epoch, 0.0, motion.speed, motion.acceleration, covariance),
         direction,
-        _agreement(pair, motion, direction, weights)[0],
+        _agreement(pair, motion, direction, even)[0],
         lead,
         (wave, energy),
         band,
