@@ -17,21 +17,27 @@ _DROPPED_SHARE = 0.5  # of the last seconds
 _WINDOW_S = 3.0
 _DRIFT_FAST_S, _DRIFT_SLOW_S = 2.0, 120.0
 _DRIFT_SIGMAS = 20.0
+_SAME = 1e-4  # relative; beyond rounding, below the steps of 12 bits
+_PILED = 0.005  # of the bins: fewer change no result
+_LEAST_LEVELS = 50.0  # of quantisation up to the largest: else neighbours share a value anyway
 
 
 def clipped(window: Window, inside: NDArray[np.bool_]) -> bool:
-    """Whether samples pile up at the largest magnitude.
+    """Whether samples pile up at one largest magnitude.
 
-    Of bins whose peak is within a tenth of the largest, most are within half a percent of it: there
-    a falling density leaves at most one in twenty, a sine three in ten.
+    Of the bins whose peak is within a tenth of the largest, two in five have that very value; a
+    falling density leaves one in a thousand there, a sine that returns to the same samples one in
+    three. Cars alike repeat their peaks too, but these are few.
     """
     peak = window.peak[inside]
     top = float(peak.max(initial=0.0))
-    if top <= 0:
+    steps = np.diff(np.unique(peak))
+    if not steps.size or top < _LEAST_LEVELS * float(steps.min()):
         return False
-    extreme = int(np.sum(peak > 0.995 * top))
+    extreme = int(np.sum(peak > (1 - _SAME) * top))
     # what stands still altogether is dead, not clipped
-    return 5 <= extreme < 0.5 * peak.size and extreme > 0.5 * int(np.sum(peak > 0.9 * top))
+    enough = max(5.0, _PILED * peak.size) <= extreme < 0.5 * peak.size
+    return enough and extreme > 0.4 * int(np.sum(peak > 0.9 * top))
 
 
 class HealthBook:
