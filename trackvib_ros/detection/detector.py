@@ -485,6 +485,8 @@ class TrainDetector:
         if not found or not all(p.known and p.confirmed and p.score > _CLEAR for p in found):
             return False
         best, traces = found[-1].hypotheses[0], found[-1].traces
+        if found[-1].direction == 0:  # without a delay, half a train is a type at another speed
+            return False
         way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
         last = float(best.fit.motion.time_at(best.places[-1] + way))
         clear = _LULL_MARGIN * self.catalogue.longest_gap / float(best.fit.motion.speed_at(last))
