@@ -365,6 +365,9 @@ class TrainDetector:
             if self._event is not None and group.watching:
                 group.onset.restart()
             group.watching = self._event is None
+            if group.watching:
+                # what rings on has been counted, and must not wait for its time to run out
+                group.onset.restart(~self._fresh_channels(group, now_ns))
             await_next(order, group)
         return events
 
@@ -509,6 +512,10 @@ class TrainDetector:
         if now_ns - self._active_ns[channel] > _REARM_NS:
             return True
         return self.channels[channel].layer == "rail" and level > _RISE * self._lowest[channel]
+
+    def _fresh_channels(self, group: _Group, now_ns: int) -> NDArray[np.bool_]:
+        levels = zip(group.index, group.trigger.level, strict=True)
+        return np.array([self._fresh(channel, float(level), now_ns) for channel, level in levels])
 
     def _deciding_last(self, event: _Event) -> int:
         """Last activity of the layer nearest to the wheels: a bridge rings on for seconds."""

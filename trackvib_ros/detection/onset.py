@@ -64,11 +64,11 @@ class Onset:
         self.threshold = sharing * _FALSE_ARRIVAL_S / bin_s
         self._shape = (channels, bands * len(GAINS))
         self._gain = np.array(GAINS)
-        self.restart()
-
-    def restart(self) -> None:
-        """Nothing has been seen."""
         self._sum = np.zeros(self._shape)
+
+    def restart(self, channels: NDArray[np.bool_] | None = None) -> None:
+        """Nothing has been seen, by some channels or (without them) by any."""
+        self._sum[slice(None) if channels is None else channels] = 0.0
 
     def look(self, ratio: Array, valid: NDArray[np.bool_], freedom: Array) -> Array:
         """The statistic after every bin for every alternative; :meth:`take` adopts the last.
