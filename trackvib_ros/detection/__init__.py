@@ -9,9 +9,10 @@ Five lines from arrays::
     print(passages[0].values["speed"], passages[0].values["type"])
 """
 
+from .arrays import detect
 from .calibration import Calibration
 from .catalogue import Catalogue, TrainType
-from .detector import DetectorConfig, TrainDetector, detect
+from .detector import DetectorConfig, TrainDetector
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent
 
 __all__ = [

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import heappop, heappush
-from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from solver import InputError
 from trackvib_ros.waveform import Waveform
@@ -51,7 +50,6 @@ _UPDATE_WITHIN = 100.0  # m at the lowest speed: what is not clear by then is no
 _BEGUN = 1.6  # energy of the first half second over the quietest: a train was near, 2 dB
 _AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
 _CLEAR = 0.8  # correlation of a whole train; the first half of one is like a short type by 0.65
-_JITTER = 3.0  # times the median deviation of a step, which rounding of the times reaches
 _AHEAD = 1.0  # m before a first wheelset that is on record
 _LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
@@ -675,117 +673,3 @@ def _enough(found: Partial, updates: int) -> bool:
     if found.types:
         return found.wheelsets >= _UPDATE_WHEELSETS[updates]
     return found.distance >= _UPDATE_AFTER[updates]
-
-
-def detect(
-    time_or_rate: float | ArrayLike,
-    samples: ArrayLike,
-    channels: Sequence[Channel] | Channel,
-    catalogue: Catalogue | None = None,
-    config: DetectorConfig | None = None,
-) -> list[TrainEvent]:
-    """Events in plain arrays, in the unit they come in (no result depends on it).
-
-    Args:
-        time_or_rate: sampling rate (Hz), or the time of every sample (s; equal steps, perhaps
-            rounded; jumps are gaps).
-        samples: shape (samples,) or (samples, channels); NaN where missing.
-        channels: one per column.
-        catalogue: train types; the shipped one by default. ``Catalogue.from_axles`` makes one.
-        config: settings.
-
-    Raises:
-        InputError: shapes disagree, numbers are none, or the times do not increase.
-    """
-    sensors = (channels,) if isinstance(channels, Channel) else tuple(channels)
-    data = _numbers("samples", samples)
-    data = data[:, None] if data.ndim == 1 else data
-    if data.ndim != 2 or data.shape[1] != len(sensors):
-        raise InputError(
-            f"samples of shape {data.shape} must be (samples, {len(sensors)}), one column per "
-            "channel"
-        )
-    names = tuple(channel.name for channel in sensors)
-    detector = TrainDetector(sensors, catalogue, config)
-    clock = _numbers("time_or_rate", time_or_rate)
-    if clock.ndim == 0:
-        if not 50 <= float(clock) <= 1e6:
-            raise InputError(f"rate = {float(clock)} Hz must lie from 50 Hz to 1 MHz")
-        pieces = [(0, len(data))]
-        dt_ns, start_ns = round(1e9 / float(clock)), np.zeros(1, dtype=np.int64)
-    else:
-        if clock.shape != (len(data),) or len(data) < 2:
-            raise InputError(f"time of shape {clock.shape} must be ({len(data)},), 2 or more")
-        dt_ns, pieces, start_ns = _grid(clock)
-    data = _in_range(data)
-    events: list[TrainEvent] = []
-    for (first, last), stamp in zip(pieces, start_ns, strict=True):
-        block = Waveform(int(stamp), dt_ns, names, data[first:last].astype(np.float32))
-        events += detector.process(block)
-    return _corrected(events + detector.finish())
-
-
-def _numbers(name: str, values: ArrayLike) -> Array:
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(np.float64), np.nan)
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiubO":
-        raise InputError(f"{name} of type {array.dtype} must be real numbers")
-    try:
-        return array.astype(np.float64)
-    except (TypeError, ValueError) as failure:
-        raise InputError(f"{name} must be real numbers: {failure}") from None
-
-
-def _in_range(data: Array) -> Array:
-    """Samples about 0 and of order 1, per channel by a power of two: they become single precision.
-
-    No result depends on the unit, nor on an offset.
-    """
-    data = np.where(np.isfinite(data), data, np.nan)
-    for column in data.T:
-        known = np.isfinite(column)
-        if known.any():
-            column[:] = _to_one(column, known)
-            column -= np.median(column[known])
-            column[:] = _to_one(column, known)
-    return data
-
-
-def _to_one(column: Array, known: NDArray[np.bool_]) -> Array:
-    return np.asarray(np.ldexp(column, -int(np.frexp(np.max(np.abs(column[known])))[1])))
-
-
-def _grid(clock: Array) -> tuple[int, list[tuple[int, int]], NDArray[np.int64]]:
-    """Step (ns) of the times of samples (s), pieces without a gap, and their stamps (ns).
-
-    Times may be rounded or jitter: the step is the mean over pieces.
-    """
-    steps = np.diff(clock)
-    if not (np.isfinite(clock).all() and np.max(np.abs(clock)) < 9e9):
-        raise InputError("time must be finite and within 9e9 s of 0")
-    if np.any(steps < 0) or clock[-1] <= clock[0]:
-        raise InputError("time must increase from sample to sample (s)")
-    span = min(64, len(steps))
-    typical = float(np.median(clock[span:] - clock[:-span])) / span
-    if typical <= 0:
-        raise InputError("time must increase from sample to sample (s)")
-    jitter = float(np.median(np.abs(steps - typical)))
-    gap = np.abs(steps - typical) > 0.5 * typical + _JITTER * jitter
-    mean = float(np.mean(steps[~gap])) if not gap.all() else typical
-    cuts = [0, *(int(c) + 1 for c in np.flatnonzero(gap)), len(clock)]
-    pieces = list(pairwise(cuts))
-    stamps = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
-    return max(1, round(1e9 * mean)), pieces, stamps
-
-
-def _corrected(events: Sequence[TrainEvent]) -> list[TrainEvent]:
-    """Events without those that a later look at the beginning of the record has replaced."""
-    out: list[TrainEvent] = []
-    for event in events:
-        if event.kind == "arrival" and any(
-            e.kind == "arrival" and e.stamp_ns >= event.stamp_ns for e in out
-        ):
-            out = [e for e in out if e.kind == "health"]
-        out.append(event)
-    return out
