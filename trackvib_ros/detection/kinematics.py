@@ -21,15 +21,11 @@ PRIOR_ACCELERATION = 0.6
 """Prior standard deviation of the acceleration (m/s²): short records cannot show it."""
 
 
-POSITION_SIGMA = 0.10
+PULSE_PLACE_SIGMA = 0.10
 """Standard deviation (m) of the place where a rail sensor seems to be, from the axis of symmetry of
 its pulses below 150 Hz: the roughness near a sensor and its place in the bay are the same for every
 wheelset. Measured on 34 channels of computed passages at 45 to 380 km/h (rms 0.098 m, three in four
 within 0.06 m)."""
-
-HIGH_BAND_POSITION_SIGMA = 0.5
-"""The same from higher bands only, when noise hides the lowest (rms 0.20 to 0.27 m, tails to
-1.3 m)."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ def regress(
     channel: NDArray[np.int64],
     epoch: float,
     prior_acceleration: float = PRIOR_ACCELERATION,
-    position_sigma: float = POSITION_SIGMA,
+    position_sigma: float = PULSE_PLACE_SIGMA,
     least_scale: float = 0.02,
 ) -> Fit:
     """Huber regression of ``place`` (m) on ``time`` (s), points of several channels together.

@@ -9,7 +9,7 @@ import numpy as np
 
 from .blind import envelope_delay
 from .head import Head, HeadMatcher
-from .kinematics import POSITION_SIGMA
+from .kinematics import PULSE_PLACE_SIGMA
 from .passage import excited, strong_interval
 from .pattern import Trace
 from .record import Record
@@ -100,7 +100,7 @@ def _by_delay(
             continue
         distance = speed * (within[1] - interval[0])
         wheelsets = max(1.0, distance / AXLE_SPACING)
-        sigma = speed * np.sqrt(2 * (POSITION_SIGMA**2 + _PULSE**2 / wheelsets)) / baseline
+        sigma = speed * np.sqrt(2 * (PULSE_PLACE_SIGMA**2 + _PULSE**2 / wheelsets)) / baseline
         best = Partial(
             speed,
             float(sigma),

@@ -243,11 +243,6 @@ class _Seen:
     offsets: list[tuple[str, float, float]]
 
 
-def _log_likelihood(score: Array, levels: float) -> Array:
-    """Of normal levels, so many of them independent, that correlate with a pattern by ``score``."""
-    return np.asarray(-0.5 * levels * np.log(1 - np.minimum(score, 0.999) ** 2))
-
-
 def _in_step(
     usable: Sequence[_Scanned], trains: Sequence[TrainType], limits: tuple[float, float]
 ) -> _Seen | None:
