@@ -117,6 +117,9 @@ class StandIn:
         acceleration: m/s².
         direction: +1 or -1.
         truncated: whether wheelsets passed before the record.
+        clock: times of the samples as told (s); the rate alone if ``None``.
+        stated: channels as told to the detector.
+        others: later trains in the same record.
     """
 
     rate: float
@@ -131,6 +134,9 @@ class StandIn:
     random: np.random.Generator
     truncated: bool = False
     marks: dict[str, Any] = field(default_factory=dict)
+    clock: Array | None = None
+    stated: tuple[Channel, ...] = ()
+    others: list[StandIn] = field(default_factory=list)
 
     @property
     def time(self) -> Array:
@@ -322,6 +328,96 @@ def _missing(s: StandIn) -> None:
     s.samples[s.random.random(len(s.samples)) < 0.05] = np.nan
 
 
+def _drops(s: StandIn) -> None:
+    """Stretches of 20 ms to 0.3 s lost, a tenth of the record or less."""
+    share, at = s.random.uniform(0.01, 0.1), 0.0
+    while at < len(s.samples):
+        length = s.random.uniform(0.02, 0.3) * s.rate
+        at += s.random.exponential(length / share)
+        s.samples[int(at) : int(at + length)] = np.nan
+
+
+def _flats(s: StandIn) -> None:
+    """One to four wheels hit the rail once a turn, up to twice as strong as a wheelset."""
+    turn = np.pi * s.random.uniform(0.76, 0.92)
+    shape, count = _rail(s.random, s.rate), int(s.random.integers(1, 5))
+    for offset in s.random.choice(s.axles, count):
+        phase, strength = s.random.random(), 10 ** s.random.uniform(-0.3, 0.3)
+        for c in range(len(s.channels)):
+            part, xi = s.part(c, offset, 40.0)
+            after = np.mod(xi / turn + phase, 1.0) * turn
+            hit = np.exp(-after / 0.15) * 10 ** (-0.6 * np.abs(xi) / 20)
+            s.samples[part, c] += strength * hit * _shaped(s.random, xi.size, shape) / _RMS
+
+
+def _joint(s: StandIn) -> None:
+    """Rail joints every 15 to 36 m: what hits them is heard up to the next one."""
+    pitch, first = s.random.uniform(15, 36), s.random.uniform(-36, 36)
+    shape, strength = _rail(s.random, s.rate), 10 ** s.random.uniform(-0.5, 0.2)
+    for c, channel in enumerate(s.channels):
+        for at in first + pitch * np.arange(-3, 8) - s.direction * channel.x:
+            for offset in s.axles if abs(at) < 20 else ():
+                part, xi = s.part(c, offset + at, 3.0)
+                hit = np.where(xi > 0, np.exp(-xi / 0.4), np.exp(xi / 0.05))
+                reach = strength * 10 ** (-0.6 * abs(at) / 20)
+                s.samples[part, c] += reach * hit * _shaped(s.random, xi.size, shape) / _RMS
+
+
+def _coupled(s: StandIn) -> None:
+    """Amplifier of a piezoelectric sensor: nothing below 0.5 to 5 Hz, undershoot after a pulse."""
+    corner = 10 ** s.random.uniform(-0.3, 0.7)
+    sos = signal.butter(1, corner, "high", fs=s.rate, output="sos")
+    s.samples[:] = signal.sosfilt(sos, s.samples, axis=0)
+
+
+def _resonant(s: StandIn) -> None:
+    """The sensor, or what it is glued to, rings: 10 to 30 times as loud at its resonance."""
+    for c in range(len(s.channels)):
+        f = min(10 ** s.random.uniform(1.8, 3.3), 0.4 * s.rate)
+        zeta = 1 / (2 * s.random.uniform(10, 30))
+        w = 2 * np.pi * f
+        b, a = signal.bilinear([w * w], [1, 2 * zeta * w, w * w], s.rate)
+        s.samples[:, c] = signal.lfilter(b, a, s.samples[:, c])
+
+
+def _reversed(s: StandIn) -> None:
+    """A sensor upside down."""
+    s.samples[:, int(s.random.integers(len(s.channels)))] *= -1
+
+
+def _bits(s: StandIn) -> None:
+    """A converter of 6 to 12 bits, full scale one to four times the peak."""
+    step = float(np.max(np.abs(s.samples))) * 2.0 ** s.random.uniform(-11, -3)
+    s.samples[:] = np.round(s.samples / step)
+
+
+def _jitter(s: StandIn) -> None:
+    """Stamps a third of a step off, in ms with three digits."""
+    clock = s.time + np.clip(s.random.normal(0, 0.15, len(s.samples)), -0.45, 0.45) / s.rate
+    s.clock = np.round(clock, 6)
+
+
+def _paced(s: StandIn) -> None:
+    """A clock that runs 1e-4 fast, and a record that starts at the seconds of an epoch."""
+    s.clock = 1_700_000_000.0 + s.time * (1 + s.random.uniform(-1e-4, 1e-4))
+
+
+def _moved(s: StandIn) -> None:
+    """Sensors that are 0.1 to 1 m (standard deviation) from where they are said to be."""
+    off = s.random.normal(0, 10 ** s.random.uniform(-1, 0), len(s.channels))
+    s.stated = tuple(
+        Channel(c.name, float(np.round(c.x + o, 2)), c.layer)
+        for c, o in zip(s.channels, off, strict=True)
+    )
+
+
+def _loggers(s: StandIn) -> None:
+    """Two loggers whose clocks are 10 ms to 1 s apart."""
+    shift = int(10 ** s.random.uniform(-2, 0) * s.random.choice([-1, 1]) * s.rate)
+    s.samples[:, -1] = np.roll(s.samples[:, -1], shift)
+    s.marks["clock"] = shift / s.rate
+
+
 def _none(_: StandIn) -> None:
     return
 
@@ -342,6 +438,17 @@ DISTURBANCES: dict[str, tuple[Callable[[StandIn], None], Callable[[StandIn], Non
     "tiny": (_none, _tiny),
     "huge": (_none, _huge),
     "missing": (_none, _missing),
+    "drops": (_none, _drops),
+    "flats": (_flats, _none),
+    "joint": (_joint, _none),
+    "coupled": (_none, _coupled),
+    "resonant": (_resonant, _none),
+    "reversed": (_none, _reversed),
+    "bits": (_none, _bits),
+    "jitter": (_none, _jitter),
+    "paced": (_none, _paced),
+    "moved": (_none, _moved),
+    "loggers": (_none, _loggers),
 }
 """What is added with the train, and what is done to the record after the noise."""
 
@@ -364,34 +471,30 @@ def stand_in(
     snr_db: float | None = None,
     train: str | None = None,
     cut: float = 0.0,
+    baseline: tuple[float, float] = BASELINE,
+    follow: float | None = None,
 ) -> StandIn:
     """One passage with everything about it drawn at random, but for what is given.
 
     Args:
         seed: of the random numbers.
-        disturbance: of :data:`DISTURBANCES`.
+        disturbance: of :data:`DISTURBANCES`; several with ``+``.
         shape: of :data:`SHAPES`.
         rate: samples per second.
         rails: 1 or 2 channels.
         snr_db: over the whole band between first and last wheelset.
         train: of :data:`TRAINS`.
         cut: share of the train that passed before the record began.
+        baseline: limits of the distance between two sensors (m).
+        follow: seconds after which another train passes.
     """
     random = np.random.default_rng(seed)
-    name = str(random.choice(list(TRAINS)))
-    name = train or name
-    axles = TRAINS[name]
-    if random.random() < 0.5:
-        axles = axles[-1] - axles[::-1]
-    speed = random.uniform(40, _TOP[name[:3]]) / 3.6
-    acceleration = random.normal(0, 0.15)
-    acceleration = float(np.clip(acceleration, -0.15 * speed**2 / axles[-1], 0.6))
-    direction = int(random.choice([-1, 1]))
+    name, axles, speed, acceleration, direction = _run(random, train)
     rate = float(random.choice(RATES)) if rate is None else rate
     snr = random.uniform(12, 40) if snr_db is None else snr_db
     channels = [Channel("a", 0.0, "rail")]
     if rails == 2:
-        channels.append(Channel("b", float(round(random.uniform(*BASELINE), 2)), "rail"))
+        channels.append(Channel("b", float(round(random.uniform(*baseline), 2)), "rail"))
     low, high, low_end, high_end = SHAPES[shape]
     empty = np.zeros((0, rails))
     s = StandIn(rate, tuple(channels), empty, name, axles, speed, 0.0, acceleration, direction,
@@ -401,14 +504,42 @@ def stand_in(
     if cut:
         s.start -= low + cut * float(np.ptp(times[0]))
         s.truncated = True
-    end = s.start + float(times.max()) + random.uniform(low_end, high_end)
+    end = s.start + float(times.max())
+    if follow is not None:
+        other = StandIn(rate, tuple(channels), empty, *_run(random)[:3], 0.0, 0.0,
+                        int(random.choice([-1, 1])), random)  # fmt: skip
+        times = np.stack([other.axle_times(c.x) for c in channels])
+        other.start = end + follow - float(times.min())
+        end = other.start + float(times.max())
+        s.others.append(other)
+    end += random.uniform(low_end, high_end)
     s.samples = np.zeros((int(end * rate), rails))
     train_signal(s)
-    added, done = DISTURBANCES[disturbance]
-    added(s)
+    for other in s.others:
+        other.samples = s.samples
+        train_signal(other)
+    named = [DISTURBANCES[one] for one in disturbance.split("+")]
+    for added, _ in named:
+        added(s)
     _noise(s, snr)
-    done(s)
+    for _, done in named:
+        done(s)
     return s
+
+
+def _run(
+    random: np.random.Generator, train: str | None = None
+) -> tuple[str, Array, float, float, int]:
+    """Name, wheelsets, speed, acceleration and direction of a train."""
+    name = str(random.choice(list(TRAINS)))
+    name = train or name
+    axles = TRAINS[name]
+    if random.random() < 0.5:
+        axles = axles[-1] - axles[::-1]
+    speed = random.uniform(40, _TOP[name[:3]]) / 3.6
+    acceleration = random.normal(0, 0.15)
+    acceleration = float(np.clip(acceleration, -0.15 * speed**2 / axles[-1], 0.6))
+    return name, axles, speed, acceleration, int(random.choice([-1, 1]))
 
 
 def catalogue(but: str = "") -> Catalogue:

@@ -144,12 +144,51 @@ def test_nothing_finite_is_an_error(samples, rate):
         (1000.0, np.ones(5) + 1j, "real numbers"),
         ([0.0, np.nan, 2.0], np.ones(3), "finite"),
         ([0.0, 0.0, 0.0], np.ones(3), "increase"),
-        ([0.0, 2e-3, 1e-3], np.ones(3), "increase"),
+        ([0.0, 2e-3, 1e-3 - 1.0], np.ones(3), "sample 2 is 1.001 s before an earlier one"),
+        (np.r_[0:2:1e-3, 1.5:3:1e-3], np.ones(3500), "set back"),
+        (np.arange(0.0, 3000.0), np.ones(3000), "must be in s"),
+        (1.7e18 + np.arange(0, 3e9, 1e6), np.ones(3000), "not ms or ns"),
+        (0, np.ones(3), "rate = 0.0 Hz"),
+        (np.arange(3.0), np.ones(4), "one per sample"),
+        (1000.0, np.ones((1, 9)), "transpose"),
     ],
 )
 def test_mistakes_in_arrays_are_named(clock, samples, named):
     with pytest.raises(InputError, match=named):
         detect(clock, samples, RAIL)
+
+
+@pytest.mark.parametrize(
+    ("channels", "known", "named"),
+    [
+        ([], None, "no channel"),
+        ([0.0], None, "Channel\\(name, x in m, layer\\)"),
+        ([RAIL, RAIL], None, "names must differ"),
+        (RAIL, {"mine": [0.0, 2.5]}, "from_axles"),
+        (RAIL, "mine.toml", "Catalogue.load"),
+    ],
+)
+def test_mistakes_beside_the_arrays_are_named(channels, known, named):
+    with pytest.raises(InputError, match=named):
+        detect(1000.0, np.ones(2000), channels, known)
+
+
+def test_samples_that_came_late_are_put_in_order(passage_of_class_425):
+    s = passage_of_class_425
+    blocks = np.array_split(np.arange(len(s.samples)), len(s.samples) // 50)
+    for i in range(0, len(blocks) - 3, 7):
+        blocks[i], blocks[i + 2] = blocks[i + 2], blocks[i]
+    order = np.concatenate(blocks)
+    late = detect(s.time[order], s.samples[order], s.channels, KNOWN)
+    assert late == detect(s.time, s.samples, s.channels, KNOWN)
+
+
+def test_times_are_dates(passage_of_class_425):
+    s = passage_of_class_425
+    dates = np.datetime64("2026-03-01T12:00:00", "ns") + (1e9 * s.time).astype("m8[ns]")
+    (passage,) = of(detect(dates, s.samples, s.channels, KNOWN), "passage")
+    first = dates[0].astype("i8") * 1e-9 + s.axle_times(0.0)[0]
+    assert passage.stamp_ns * 1e-9 == pytest.approx(first, abs=0.02)
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("spikes", 5_000_021), ("rain", 5_000_020)])

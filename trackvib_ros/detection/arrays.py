@@ -17,6 +17,8 @@ from .events import Channel, TrainEvent
 
 Array = NDArray[np.float64]
 
+_LATE_S = 1.0  # a sample this far behind is not late: the clock was set back
+_DENSE = 64  # samples over which the pace of a clock is taken
 _JITTER = 3.0  # times the median deviation of a step, which rounding of the times reaches
 
 
@@ -30,27 +32,39 @@ def detect(
     """Events in plain arrays, in the unit they come in (no result depends on it).
 
     Args:
-        time_or_rate: sampling rate (Hz), or the time of every sample (s; equal steps, perhaps
-            rounded; jumps are gaps).
+        time_or_rate: sampling rate (Hz), or the time of every sample (s, or ``datetime64``; equal
+            steps, perhaps rounded; jumps are gaps). Samples that came less than a second late are
+            put in order of time.
         samples: shape (samples,) or (samples, channels); NaN where missing.
         channels: one per column.
         catalogue: train types; the shipped one by default. ``Catalogue.from_axles`` makes one.
         config: settings.
 
     Raises:
-        InputError: shapes disagree, numbers are none, or the times do not increase.
+        InputError: shapes disagree, numbers are none, or the times go back.
     """
     sensors = (channels,) if isinstance(channels, Channel) else tuple(channels)
+    for channel in sensors:
+        if not isinstance(channel, Channel):
+            raise InputError(
+                f"channels has {channel!r}; give one Channel(name, x in m, layer) per column"
+            )
+    if catalogue is not None and not isinstance(catalogue, Catalogue):
+        raise InputError(
+            f"catalogue is a {type(catalogue).__name__}; make a Catalogue: "
+            'Catalogue.from_axles({"name": [positions in m]}) or Catalogue.load(path)'
+        )
+    detector = TrainDetector(sensors, catalogue, config)
     data = _numbers("samples", samples)
     data = data[:, None] if data.ndim == 1 else data
     if data.ndim != 2 or data.shape[1] != len(sensors):
+        turned = data.ndim == 2 and data.shape[0] == len(sensors)
         raise InputError(
             f"samples of shape {data.shape} must be (samples, {len(sensors)}), one column per "
-            "channel"
+            f"channel{'; transpose them' if turned else ''}"
         )
     names = tuple(channel.name for channel in sensors)
-    detector = TrainDetector(sensors, catalogue, config)
-    clock = _numbers("time_or_rate", time_or_rate)
+    clock = _seconds(time_or_rate)
     if clock.ndim == 0:
         if not 50 <= float(clock) <= 1e6:
             raise InputError(f"rate = {float(clock)} Hz must lie from 50 Hz to 1 MHz")
@@ -58,7 +72,11 @@ def detect(
         dt_ns, start_ns = round(1e9 / float(clock)), np.zeros(1, dtype=np.int64)
     else:
         if clock.shape != (len(data),) or len(data) < 2:
-            raise InputError(f"time of shape {clock.shape} must be ({len(data)},), 2 or more")
+            raise InputError(
+                f"time of shape {clock.shape} must be ({len(data)},), one per sample and two or "
+                "more; for a rate give one number (Hz)"
+            )
+        clock, data = _in_order(clock, data)
         dt_ns, pieces, start_ns = _grid(clock)
     data = _in_range(data)
     events: list[TrainEvent] = []
@@ -78,6 +96,40 @@ def _numbers(name: str, values: ArrayLike) -> Array:
         return array.astype(np.float64)
     except (TypeError, ValueError) as failure:
         raise InputError(f"{name} must be real numbers: {failure}") from None
+
+
+def _seconds(time_or_rate: float | ArrayLike) -> Array:
+    """The rate (Hz), or times in s, of dates since 1970."""
+    array = np.asarray(time_or_rate)
+    if array.dtype.kind not in "mM":
+        return _numbers("time_or_rate", array)
+    known = np.where(np.isnat(array), np.nan, array.astype(f"{array.dtype.kind}8[ns]").view("i8"))
+    return np.asarray(1e-9 * known)
+
+
+def _in_order(clock: Array, data: Array) -> tuple[Array, Array]:
+    """Times (s) and samples in order of time, if only some came late on their way.
+
+    Raises:
+        InputError: times are not finite, out of range, or go back by a second and more.
+    """
+    if not (np.isfinite(clock).all() and np.max(np.abs(clock)) < 9e9):
+        raise InputError("time must be finite and within 9e9 s of 0; it is in s, not ms or ns")
+    back = np.maximum.accumulate(clock) - clock
+    worst = int(np.argmax(back))
+    if not back[worst]:
+        return clock, data
+    order = np.argsort(clock, kind="stable")
+    ordered = clock[order]
+    span = min(_DENSE, len(clock) - 1)
+    pace, as_came = (t[span:] - t[:-span] for t in (ordered, clock))
+    # samples in their order are nowhere denser than elsewhere; a clock set back fills a time twice
+    if back[worst] >= _LATE_S or pace.min() < 0.75 * float(np.median(as_came)):
+        raise InputError(
+            f"time must increase from sample to sample (s); sample {worst} is {back[worst]:.6g} s "
+            "before an earlier one: if the clock was set back, give the parts one by one"
+        )
+    return ordered, data[order]
 
 
 def _in_range(data: Array) -> Array:
@@ -105,17 +157,20 @@ def _grid(clock: Array) -> tuple[int, list[tuple[int, int]], NDArray[np.int64]]:
     Times may be rounded or jitter: the step is the mean over pieces.
     """
     steps = np.diff(clock)
-    if not (np.isfinite(clock).all() and np.max(np.abs(clock)) < 9e9):
-        raise InputError("time must be finite and within 9e9 s of 0")
-    if np.any(steps < 0) or clock[-1] <= clock[0]:
+    if clock[-1] <= clock[0]:
         raise InputError("time must increase from sample to sample (s)")
-    span = min(64, len(steps))
+    span = min(_DENSE, len(steps))
     typical = float(np.median(clock[span:] - clock[:-span])) / span
     if typical <= 0:
         raise InputError("time must increase from sample to sample (s)")
     jitter = float(np.median(np.abs(steps - typical)))
     gap = np.abs(steps - typical) > 0.5 * typical + _JITTER * jitter
     mean = float(np.mean(steps[~gap])) if not gap.all() else typical
+    if not 50 <= 1 / mean <= 1e6:
+        raise InputError(
+            f"time has steps of {mean:.6g}, a rate of {1 / mean:.6g} Hz; it must be in s, at 50 Hz "
+            "to 1 MHz"
+        )
     cuts = [0, *(int(c) + 1 for c in np.flatnonzero(gap)), len(clock)]
     pieces = list(pairwise(cuts))
     stamps = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)

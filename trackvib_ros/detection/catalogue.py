@@ -173,9 +173,14 @@ class Catalogue:
         """Catalogue of bare axle positions (m) by name; the first wheelset need not be at 0."""
         types = []
         for name, positions in trains.items():
-            axles = np.sort(np.asarray(positions, dtype=float))
+            try:
+                axles = np.sort(np.asarray(positions, dtype=float).ravel())
+            except (TypeError, ValueError):
+                axles = np.empty(0)
             if axles.size < 2:
-                raise InputError(f"train {name!r}: give two or more axle positions (m)")
+                raise InputError(
+                    f"train {name!r}: axle positions = {positions!r} must be two or more numbers, m"
+                )
             types.append(
                 TrainType(
                     name=name,

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
 from solver import InputError
 
 Layer: TypeAlias = Literal["rail", "slab", "support_layer", "bridge"]
@@ -40,13 +42,18 @@ class Channel:
     layer: Layer = "rail"
 
     def __post_init__(self) -> None:
-        """Check layer and position."""
+        """Check name, layer and position."""
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"channel name = {self.name!r} must be a text")
         if self.layer not in LAYERS:
             raise InputError(
                 f"channel {self.name!r}: layer = {self.layer!r} is not one of {', '.join(LAYERS)}"
             )
-        if not abs(self.x) < 1e9:
-            raise InputError(f"channel {self.name!r}: x = {self.x} m must be a finite position")
+        number = isinstance(self.x, (int, float, np.number)) and not isinstance(self.x, bool)
+        if not number or not abs(self.x) < 1e9:
+            raise InputError(
+                f"channel {self.name!r}: x = {self.x!r} must be a finite position (m)"
+            )
 
 
 @dataclass(frozen=True)
