@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 from heapq import heappop, heappush
 
@@ -16,15 +16,14 @@ from trackvib_ros.waveform import Waveform
 from . import report
 from .calibration import POSITION_SIGMA, Calibration
 from .catalogue import Catalogue
-from .events import Channel, Estimate, TrainEvent, Value
-from .features import GroupStream
+from .closing import Closing, Ended
+from .events import Channel, TrainEvent
+from .group import Group
 from .head import HeadMatcher
-from .health import HealthBook, clipped
-from .live import Partial, departed, provisional
-from .onset import GAINS, WARM_UP, Onset, Trigger, quietest
-from .passage import Passage, excited, find_passages
+from .live import Partial, provisional
+from .occupancy import Occupancy
+from .onset import GAINS
 from .record import Record
-from .response import find_response
 
 Array = NDArray[np.float64]
 
@@ -33,25 +32,16 @@ _CHUNK_NS = 1_000_000_000
 _BEFORE_NS = 2_500_000_000  # pre-trigger part of an event window
 _REARM_NS = 2_000_000_000  # a bridge rings down through its threshold several times
 _RISE = 10.0  # a train on rails that still ring
-_FADED = 1 / 100  # of the strongest level of an event: what is left is no train
-_STRONG = 1 / 4  # of the strongest level: a wheelset is near
-_CREEP = 1.023  # by which the least level is forgotten a frame, 10 dB/s
-_RISEN = 1.6  # over the least level: another wheelset comes, 2 dB
-_HANG_LEAST_S, _HANG_FACTOR, _HANG_MORE_S = 1.0, 2.0, 0.5
 _LULL_NS = 250_000_000  # least quiet time after which a train may be past
 _LULL_FACTOR = 1.3  # over its longest lull so far
 _LULL_MARGIN = 1.15  # over the longest gap of wheelsets in the catalogue
-_HANG_LEARNT_NS = 1_000_000_000
 _UPDATE_NS = 200_000_000
 _UPDATE_GROWTH = 0.25  # of the time passed, between trials
 _UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
 _UPDATE_WHEELSETS = (4, 12)  # by pattern, on one channel
 _UPDATE_WITHIN = 100.0  # m at the lowest speed: what is not clear by then is no train
 _BEGUN = 1.6  # energy of the first half second over the quietest: a train was near, 2 dB
-_AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
 _CLEAR = 0.8  # correlation of a whole train; the first half of one is like a short type by 0.65
-_AHEAD = 1.0  # m before a first wheelset that is on record
-_LAYER_ORDER = ("rail", "slab", "support_layer", "bridge")
 
 
 @dataclass(frozen=True)
@@ -92,74 +82,12 @@ class DetectorConfig:
             )
 
 
-class _Group:
-    """One block group: its stream, its trigger, where its channels stand in the detector."""
-
-    def __init__(self, block: Waveform, index: list[int], keep_s: float, sharing: int) -> None:
-        self.stream = GroupStream(block.channels, block.dt_ns, keep_s)
-        self.index = index
-        self.next_bin = 0
-        self.calm_s = 0.0
-        self.trigger = self._trigger()
-        self.onset = Onset(len(index), len(self.stream.bands), self.stream.step, sharing)
-        self.watching = True
-
-    def _trigger(self) -> Trigger:
-        stream = self.stream
-        return Trigger(
-            len(self.index), stream.bands, stream.frame_s, stream.frame_bins * stream.freedom
-        )
-
-    def quietest(self, until_ns: int) -> Array:
-        """Noise floors by the quietest stretch up to a time, (channels, bands)."""
-        stream = self.stream
-        rows = (stream.measured(row, until_ns) for row in range(len(self.index)))
-        return np.stack([quietest(row, stream.bands, stream.frame_s) for row in rows])
-
-    def begin_again(self, floor: Array) -> None:
-        """Take the frames from the first one on, with noise floors (channels, bands)."""
-        self.next_bin = 0
-        self.trigger = self._trigger()
-        self.trigger.start_from(floor)
-        self.onset.restart()
-        self.watching = True
-
-    def rises(self, until_ns: int) -> tuple[Array | None, list[tuple[int, int, int]]]:
-        """The onset test in the next decision frame, as far as it goes.
-
-        Returns:
-            Statistic; time after the bin in which it crosses its threshold, channel of the group
-            and alternative.
-        """
-        ready = self.trigger.seen >= WARM_UP
-        if not self.watching or not ready.any():
-            return None, []
-        energy, valid, ends = self.stream.fresh(self.next_bin, until_ns)
-        if not len(ends):
-            return None, []
-        valid = valid & ready
-        with np.errstate(invalid="ignore"):
-            ratio = np.where(valid[..., None], energy / self.trigger.floor, 0.0)
-        statistic = self.onset.look(ratio, valid, self.stream.freedom * self.trigger.whiteness)
-        over = statistic.mean(axis=2) > self.onset.threshold
-        found = []
-        for local in np.flatnonzero(over.any(axis=0)):
-            at = int(np.argmax(over[:, local]))
-            found.append((int(ends[at]), int(local), int(np.argmax(statistic[at, local]))))
-        return statistic, found
-
-
 @dataclass
-class _Event:
-    start_ns: int
-    last_ns: dict[int, int]
-    strongest: dict[int, float]
-    least: dict[int, float]
-    pause_ns: dict[int, int]
+class _Event(Occupancy):
+    """An event, with what was told and tried since its onset."""
+
     next_update_ns: int = 0
     updates: int = 0
-    strong_ns: dict[int, int] = field(default_factory=dict)
-    lull_ns: dict[int, int] = field(default_factory=dict)
     trial_ns: int = 0
     past_ns: int | None = None
 
@@ -176,9 +104,6 @@ class TrainDetector:
         catalogue: train types; the shipped one by default.
         config: settings.
         calibration: what earlier passages have taught, :attr:`calibration` of another detector.
-
-    Attributes:
-        calibration: where the channels are, as learned from the passages so far.
 
     Raises:
         InputError: no channel, a name twice, or a calibration of other channels.
@@ -211,8 +136,8 @@ class TrainDetector:
 
     def reset(self) -> None:
         """Forget everything since the start, noise floors included: the clock jumped back."""
-        self.calibration = self._given
-        self._groups: dict[tuple[str, ...], _Group] = {}
+        self._closing = Closing(self.channels, self.catalogue, self._limits, self._given)
+        self._groups: dict[tuple[str, ...], Group] = {}
         self._start_ns: int | None = None
         self._done_ns = 0
         self._event: _Event | None = None
@@ -220,9 +145,13 @@ class TrainDetector:
         self._replay = False
         self._inside = False
         self._replayed_ns = -(2**62)
-        self._health = HealthBook(self.channels)
         self._lowest = np.full(len(self.channels), np.inf)
         self._active_ns = np.full(len(self.channels), -(2**62), dtype=np.int64)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Where the channels are, as learned from the passages so far."""
+        return self._closing.calibration
 
     def process(self, block: Waveform) -> list[TrainEvent]:
         """Take the next block of a group; events that it completes.
@@ -258,7 +187,7 @@ class TrainDetector:
             events += self._close(now)
         return events
 
-    def _group_of(self, block: Waveform) -> _Group:
+    def _group_of(self, block: Waveform) -> Group:
         group = self._groups.get(block.channels)
         if group is None:
             unknown = [name for name in block.channels if name not in self._index]
@@ -276,7 +205,7 @@ class TrainDetector:
                     f"dt_ns = {block.dt_ns} ns must be positive and at most 20 000 000 ns (50 Hz)"
                 )
             index = [self._index[n] for n in block.channels]
-            group = _Group(block, index, self._keep_s, len(self.channels))
+            group = Group(block, index, self._keep_s, len(self.channels))
             self._groups[block.channels] = group
         if block.data.ndim != 2 or block.data.shape[1] != len(block.channels):
             raise InputError(
@@ -317,9 +246,9 @@ class TrainDetector:
 
     def _frames(self, until_ns: int) -> list[TrainEvent]:
         """Take bins and decision frames that end by a time, in order of time over all groups."""
-        queue: list[tuple[int, int, int, int, _Group, Array | None]] = []
+        queue: list[tuple[int, int, int, int, Group, Array | None]] = []
 
-        def await_next(order: int, group: _Group) -> None:
+        def await_next(order: int, group: Group) -> None:
             statistic, rises = group.rises(until_ns)
             for at_ns, local, best in rises:
                 heappush(queue, (at_ns, order, local, best, group, None))
@@ -343,7 +272,7 @@ class TrainDetector:
                 group.onset.take(statistic)
             active = group.trigger.step(frame.energy, frame.valid & ~frame.still, frozen=in_event)
             if now_ns > self._replayed_ns:
-                events += self._health.step(
+                events += self._closing.health.step(
                     now_ns,
                     group.stream.frame_s,
                     group.index,
@@ -369,10 +298,9 @@ class TrainDetector:
             await_next(order, group)
         return events
 
-    def _calmed(self, group: _Group) -> bool:
+    def _calmed(self, group: Group) -> bool:
         """Whether a group has become much quieter than when its floor was learned, for a while."""
-        recent = group.trigger.recent
-        calm = bool(np.any((recent > 0) & (group.trigger.first_floor > _BEGUN * recent)))
+        calm = group.louder_before(_BEGUN)
         group.calm_s = group.calm_s + group.stream.frame_s if calm else 0.0
         return group.calm_s > self.config.hang
 
@@ -397,7 +325,7 @@ class TrainDetector:
         self._lowest[:] = np.inf
         self._active_ns[:] = -(2**62)
 
-    def _open(self, now_ns: int, group: _Group, local: int, best: int) -> list[TrainEvent]:
+    def _open(self, now_ns: int, group: Group, local: int, best: int) -> list[TrainEvent]:
         """An event begins where energy rises, unless an earlier train rings on."""
         channel = group.index[local]
         if self._event is not None or not self._fresh(
@@ -406,17 +334,18 @@ class TrainDetector:
             return []
         band, gain = divmod(best, len(GAINS))
         start = now_ns - round((group.stream.step + group.stream.shift[band]) * 1e9)
-        self._event = _Event(start, {}, {}, {}, {})
+        self._event = _Event(self.channels, start)
         self._event.next_update_ns = now_ns + _UPDATE_NS
         return [report.arrival(self.channels[channel], start, GAINS[gain])]
 
-    def _decide(self, now_ns: int, group: _Group, active: NDArray[np.bool_]) -> list[TrainEvent]:
+    def _decide(self, now_ns: int, group: Group, active: NDArray[np.bool_]) -> list[TrainEvent]:
         events: list[TrainEvent] = []
         for local in np.flatnonzero(active):
             channel = group.index[local]
             level = float(group.trigger.level[local])
             if self._event is not None:
-                self._follow(self._event, channel, float(group.trigger.steady[local]), now_ns)
+                if self._event.follow(channel, float(group.trigger.steady[local]), now_ns):
+                    self._event.past_ns = None
             elif self._fresh(channel, level, now_ns):
                 continue  # not yet an onset
             self._active_ns[channel] = now_ns
@@ -426,42 +355,17 @@ class TrainDetector:
             )
         if self._event is None:
             return events
-        last = self._deciding_last(self._event)
-        if now_ns - last > self._hang_ns(self._event, now_ns):
+        if now_ns - self._event.last() > self._event.hang_ns(self.config.hang):
             events += self._close(now_ns)
         elif now_ns - self._event.start_ns > self.config.max_event * 1e9:
             events += self._close(now_ns)
             for other in self._groups.values():
-                for row in range(len(other.index)):
-                    other.trigger.relearn(row)
+                other.relearn()
         elif self._past(self._event, now_ns):
-            events += self._close(now_ns, max(self._strong(self._event).values()))
+            events += self._close(now_ns, max(self._event.strong().values()))
         elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
             events += self._update(self._event, now_ns)
         return events
-
-    def _follow(self, event: _Event, channel: int, level: float, now_ns: int) -> None:
-        """Note when a wheelset was last near: strong energy, or energy that rises again.
-
-        What only fades is a train that leaves: a rail carries it on, 1 dB/m weaker.
-        """
-        strongest = max(level, event.strongest.get(channel, 0.0))
-        least = min(level, _CREEP * event.least.get(channel, level))
-        event.strongest[channel], event.least[channel] = strongest, least
-        if level > _STRONG * strongest:
-            lull = now_ns - event.strong_ns.get(channel, now_ns)
-            event.lull_ns[channel] = max(lull, event.lull_ns.get(channel, 0))
-            event.strong_ns[channel], event.past_ns = now_ns, None
-        near = level > _STRONG * strongest or level > max(_FADED * strongest, _RISEN * least)
-        if near or _FADED * strongest < 1:
-            if channel in event.last_ns:
-                pause = now_ns - event.last_ns[channel]
-                event.pause_ns[channel] = max(pause, event.pause_ns.get(channel, 0))
-            event.last_ns[channel] = now_ns
-
-    def _strong(self, event: _Event) -> dict[int, int]:
-        """When each rail channel was last strong."""
-        return {c: t for c, t in event.strong_ns.items() if self.channels[c].layer == "rail"}
 
     def _past(self, event: _Event, now_ns: int) -> bool:
         """Whether a train of a known type has passed whole, before the quiet time is over.
@@ -471,7 +375,7 @@ class TrainDetector:
         """
         if event.past_ns is not None:
             return now_ns >= event.past_ns
-        strong = self._strong(event)
+        strong = event.strong()
         if not strong or now_ns < event.trial_ns:
             return False
         latest = max(strong, key=lambda c: strong[c])
@@ -482,7 +386,7 @@ class TrainDetector:
         origin = event.start_ns - _BEFORE_NS
         end = (strong[latest] - origin) * 1e-9
         within = ((event.start_ns - origin) * 1e-9 - 0.5, end)
-        found = self._find(self._rails(origin, now_ns), within)
+        found = self._closing.search(self._rails(origin, now_ns), within)
         if not found or not all(p.known and p.confirmed and p.score > _CLEAR for p in found):
             return False
         best, traces = found[-1].hypotheses[0], found[-1].traces
@@ -496,32 +400,15 @@ class TrainDetector:
         event.past_ns = max(now_ns, origin + round((last + clear) * 1e9))
         return now_ns >= event.past_ns
 
-    def _hang_ns(self, event: _Event, now_ns: int) -> int:
-        """Quiet time that ends an event: a multiple of the longest pause that it had so far."""
-        pauses = [t for c, t in event.pause_ns.items() if self.channels[c].layer == "rail"]
-        last = self._deciding_last(event)
-        if not pauses or last - event.start_ns < _HANG_LEARNT_NS:
-            return round(self.config.hang * 1e9)
-        hang = _HANG_FACTOR * max(pauses) * 1e-9 + _HANG_MORE_S
-        return round(1e9 * min(max(hang, _HANG_LEAST_S), self.config.hang))
-
     def _fresh(self, channel: int, level: float, now_ns: int) -> bool:
         """Whether the activity of a channel is new, not what an earlier train left ringing."""
         if now_ns - self._active_ns[channel] > _REARM_NS:
             return True
         return self.channels[channel].layer == "rail" and level > _RISE * self._lowest[channel]
 
-    def _fresh_channels(self, group: _Group, now_ns: int) -> NDArray[np.bool_]:
+    def _fresh_channels(self, group: Group, now_ns: int) -> NDArray[np.bool_]:
         levels = zip(group.index, group.trigger.level, strict=True)
         return np.array([self._fresh(channel, float(level), now_ns) for channel, level in levels])
-
-    def _deciding_last(self, event: _Event) -> int:
-        """Last activity of the layer nearest to the wheels: a bridge rings on for seconds."""
-        for layer in _LAYER_ORDER:
-            times = [t for c, t in event.last_ns.items() if self.channels[c].layer == layer]
-            if times:
-                return max(times)
-        return event.start_ns
 
     def _close(self, now_ns: int, last_ns: int | None = None) -> list[TrainEvent]:
         event = self._event
@@ -534,48 +421,21 @@ class TrainDetector:
                 return []
         self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
-        records = self._records(origin, now_ns)
-        last = self._deciding_last(event) if last_ns is None else last_ns
+        last = event.last() if last_ns is None else last_ns
         within = (
             (event.start_ns - origin) * 1e-9 - 0.5,
             (last - origin) * 1e-9 + 0.3,
         )
-        inside, self._inside = self._inside, False
-        found = self._find(records, within)
-        if inside and not self._whole(found, origin):
-            part = self._truncated(last, now_ns)
-            if part is not None:
-                return part
-        if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
-            away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
-            # strong first cars end an event on a bridge early; what rings on does no harm
-            span = (within[0], (now_ns - origin) * 1e-9)
-            train = find_response(away, span, self.catalogue.types, self._limits)
-            if train is not None and train.confirmed:
-                return report.response(self.catalogue, records, origin, train)
-        if records and not any(passage.confirmed for passage in found):
-            found, swapped = self._try_swapped(records, within, found)
-        else:
-            swapped = []
-        for passage in found:
-            if passage.confirmed and passage.known and passage.measured is not None and not swapped:
-                self.calibration = self.calibration.learned(passage.measured)
-        events = self._passage_health(now_ns, records, within, found, swapped)
-        return events + report.closing(self.catalogue, records, origin, within, found)
-
-    def _find(self, records: list[Record], within: tuple[float, float]) -> list[Passage]:
-        return find_passages(records, within, self.catalogue, self._limits, self.calibration)
+        begun = None
+        if self._inside:
+            start = self._start_ns or 0
+            begun, self._inside = (self._rails(start, now_ns), start), False
+        records = self._records(origin, now_ns)
+        return self._closing.conclude(Ended(records, origin, within, now_ns, last, begun))
 
     def _records(self, from_ns: int, to_ns: int) -> list[Record]:
-        records = []
-        for group in self._groups.values():
-            for local, channel in enumerate(group.index):
-                window = group.stream.window(local, from_ns, to_ns)
-                if window.time.size > 50 and np.isfinite(group.trigger.floor[local]).all():
-                    records.append(
-                        Record(self.channels[channel], window, group.trigger.floor[local].copy())
-                    )
-        return records
+        groups = self._groups.values()
+        return [r for g in groups for r in g.records(self.channels, from_ns, to_ns)]
 
     def _update(self, event: _Event, now_ns: int) -> list[TrainEvent]:
         passed = now_ns - event.start_ns
@@ -596,77 +456,6 @@ class TrainDetector:
 
     def _rails(self, from_ns: int, to_ns: int) -> list[Record]:
         return [r for r in self._records(from_ns, to_ns) if r.channel.layer == "rail"]
-
-    def _whole(self, found: Sequence[Passage], origin_ns: int) -> bool:
-        """Whether the first of the trains is on record from its first wheelset on."""
-        if not found or not found[0].known:
-            return False
-        best = found[0].hypotheses[0]
-        start = ((self._start_ns or 0) - origin_ns) * 1e-9
-        return float(best.fit.motion.time_at(-_AHEAD)) > start
-
-    def _truncated(self, last_ns: int, now_ns: int) -> list[TrainEvent] | None:
-        """Events of a train whose beginning is not on record; ``None`` if that is not so."""
-        origin = self._start_ns or 0
-        records = self._rails(origin, now_ns)
-        within = (0.0, (last_ns - origin) * 1e-9 + 0.3)
-        mirrored = HeadMatcher(self.catalogue.types, self._limits, mirrored=True)
-        found, quiet = departed(records, within, self._limits, mirrored)
-        if found is not None:
-            return report.truncated(self.catalogue, found, origin)
-        if quiet > _AT_ONCE_S:
-            return None
-        return report.unclear(records, last_ns, ("truncated_start",))
-
-    def _try_swapped(
-        self,
-        records: list[Record],
-        within: tuple[float, float],
-        found: list[Passage],
-    ) -> tuple[list[Passage], list[str]]:
-        """Rail channels that show no wheelsets while others do: their cables are exchanged."""
-        if not any(r.channel.layer == "rail" for r in records):
-            return found, []
-        others = [
-            replace(r, channel=replace(r.channel, layer="rail"))
-            for r in records
-            if r.channel.layer != "rail"
-        ]
-        instead = self._find(others, within) if others else []
-        sure = [p for p in instead if p.known]
-        return (sure, [trace.name for trace in sure[0].traces]) if sure else (found, [])
-
-    def _passage_health(
-        self,
-        now_ns: int,
-        records: list[Record],
-        within: tuple[float, float],
-        found: list[Passage],
-        swapped: list[str],
-    ) -> list[TrainEvent]:
-        events: list[TrainEvent] = []
-        trains = [passage for passage in found if passage.confirmed]
-        if not trains:
-            return events
-        used = {trace.name for trace in trains[0].traces}
-        offsets = {name: (o, sigma) for name, o, sigma in trains[0].clock_offset}
-        for record in records:
-            name = record.channel.name
-            inside = (record.window.time >= within[0]) & (record.window.time <= within[1])
-            if not inside.any():
-                continue
-            tell = self._health.tell
-            events += tell(now_ns, name, "clipped", clipped(record.window, inside), {})
-            events += tell(now_ns, name, "swapped", name in swapped, {})
-            if record.channel.layer != "rail" or name in swapped:
-                continue
-            quiet = name not in used and not excited(record, within)
-            events += tell(now_ns, name, "insensitive", quiet and not swapped, {})
-            values: dict[str, Value] = {}
-            if name in offsets:
-                values["clock_offset"] = Estimate(*offsets[name], "s")
-            events += tell(now_ns, name, "unsynchronised", name in offsets, values)
-        return events
 
 
 def _enough(found: Partial, updates: int) -> bool:

@@ -1,0 +1,175 @@
+"""What an event that has ended tells: its trains, the state of the sensors, where these are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import report
+from .calibration import Calibration
+from .catalogue import Catalogue
+from .events import Channel, Estimate, TrainEvent, Value
+from .head import HeadMatcher
+from .health import HealthBook, clipped
+from .live import departed
+from .passage import Passage, excited, find_passages
+from .record import Record
+from .response import find_response
+
+Array = NDArray[np.float64]
+
+_AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
+_AHEAD = 1.0  # m before a first wheelset that is on record
+
+
+@dataclass(frozen=True)
+class Ended:
+    """An event that has ended.
+
+    Attributes:
+        records: all channels, with times after ``origin_ns``.
+        origin_ns: some time before the onset.
+        within: onset and last activity (s after ``origin_ns``), with margins.
+        now_ns: end of the records.
+        last_ns: last activity.
+        begun: the rail channels from the start of the stream on, and that start (ns), if a train
+            was near then; else ``None``.
+    """
+
+    records: list[Record]
+    origin_ns: int
+    within: tuple[float, float]
+    now_ns: int
+    last_ns: int
+    begun: tuple[list[Record], int] | None = None
+
+
+class Closing:
+    """Finds the trains of ended events, and learns from them.
+
+    Args:
+        channels: all channels of the detector.
+        catalogue: train types.
+        limits: lowest and highest speed (m/s).
+        calibration: what earlier passages have taught.
+
+    Attributes:
+        calibration: with what the events so far have taught.
+        health: states of the sensors.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[Channel],
+        catalogue: Catalogue,
+        limits: tuple[float, float],
+        calibration: Calibration,
+    ) -> None:
+        self.calibration = calibration
+        self.health = HealthBook(channels)
+        self._catalogue = catalogue
+        self._limits = limits
+
+    def search(self, records: Sequence[Record], within: tuple[float, float]) -> list[Passage]:
+        """Every train that the rail channels show in an interval (s)."""
+        return find_passages(records, within, self._catalogue, self._limits, self.calibration)
+
+    def conclude(self, ended: Ended) -> list[TrainEvent]:
+        """The events at the end of an event; what its trains teach is kept."""
+        records, within = ended.records, ended.within
+        found = self.search(records, within)
+        if ended.begun is not None:
+            rails, start_ns = ended.begun
+            if not _whole(found, (start_ns - ended.origin_ns) * 1e-9):
+                part = self._truncated(rails, start_ns, ended.last_ns)
+                if part is not None:
+                    return part
+        if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
+            away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
+            # strong first cars end an event on a bridge early; what rings on does no harm
+            span = (within[0], (ended.now_ns - ended.origin_ns) * 1e-9)
+            train = find_response(away, span, self._catalogue.types, self._limits)
+            if train is not None and train.confirmed:
+                return report.response(self._catalogue, records, ended.origin_ns, train)
+        swapped: list[str] = []
+        if records and not any(passage.confirmed for passage in found):
+            found, swapped = self._try_swapped(records, within, found)
+        for passage in found:
+            if passage.confirmed and passage.known and passage.measured is not None and not swapped:
+                self.calibration = self.calibration.learned(passage.measured)
+        events = self._passage_health(ended.now_ns, records, within, found, swapped)
+        return events + report.closing(self._catalogue, records, ended.origin_ns, within, found)
+
+    @cached_property
+    def _mirrored(self) -> HeadMatcher:
+        return HeadMatcher(self._catalogue.types, self._limits, mirrored=True)
+
+    def _truncated(
+        self, rails: list[Record], start_ns: int, last_ns: int
+    ) -> list[TrainEvent] | None:
+        """Events of a train whose beginning is not on record; ``None`` if that is not so."""
+        within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
+        found, quiet = departed(rails, within, self._limits, self._mirrored)
+        if found is not None:
+            return report.truncated(self._catalogue, found, start_ns)
+        if quiet > _AT_ONCE_S:
+            return None
+        return report.unclear(rails, last_ns, ("truncated_start",))
+
+    def _try_swapped(
+        self, records: list[Record], within: tuple[float, float], found: list[Passage]
+    ) -> tuple[list[Passage], list[str]]:
+        """Rail channels that show no wheelsets while others do: their cables are exchanged."""
+        if not any(r.channel.layer == "rail" for r in records):
+            return found, []
+        others = [
+            replace(r, channel=replace(r.channel, layer="rail"))
+            for r in records
+            if r.channel.layer != "rail"
+        ]
+        instead = self.search(others, within) if others else []
+        sure = [p for p in instead if p.known]
+        return (sure, [trace.name for trace in sure[0].traces]) if sure else (found, [])
+
+    def _passage_health(
+        self,
+        now_ns: int,
+        records: list[Record],
+        within: tuple[float, float],
+        found: list[Passage],
+        swapped: list[str],
+    ) -> list[TrainEvent]:
+        events: list[TrainEvent] = []
+        trains = [passage for passage in found if passage.confirmed]
+        if not trains:
+            return events
+        used = {trace.name for trace in trains[0].traces}
+        offsets = {name: (o, sigma) for name, o, sigma in trains[0].clock_offset}
+        tell = self.health.tell
+        for record in records:
+            name = record.channel.name
+            inside = (record.window.time >= within[0]) & (record.window.time <= within[1])
+            if not inside.any():
+                continue
+            events += tell(now_ns, name, "clipped", clipped(record.window, inside), {})
+            events += tell(now_ns, name, "swapped", name in swapped, {})
+            if record.channel.layer != "rail" or name in swapped:
+                continue
+            quiet = name not in used and not excited(record, within)
+            events += tell(now_ns, name, "insensitive", quiet and not swapped, {})
+            values: dict[str, Value] = {}
+            if name in offsets:
+                values["clock_offset"] = Estimate(*offsets[name], "s")
+            events += tell(now_ns, name, "unsynchronised", name in offsets, values)
+        return events
+
+
+def _whole(found: Sequence[Passage], start: float) -> bool:
+    """Whether the first of the trains is on record, from ``start`` (s), with its first wheelset."""
+    if not found or not found[0].known:
+        return False
+    return float(found[0].hypotheses[0].fit.motion.time_at(-_AHEAD)) > start
