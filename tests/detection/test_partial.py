@@ -90,7 +90,7 @@ def check_truncated(events, speed, reference_end):
 
 
 @pytest.mark.parametrize("rails", [1, 2])
-@pytest.mark.parametrize("share", [0.15, 0.5])
+@pytest.mark.parametrize("share", [0.2, 0.5])
 def test_a_recording_cut_inside_its_train(share, rails):
     rate, data, channels, train = demo_rails()
     whole = detect(rate, data, channels)

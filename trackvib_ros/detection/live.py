@@ -7,17 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .blind import envelope_delay
-from .head import Head, HeadMatcher
-from .kinematics import PULSE_PLACE_SIGMA
+from .delay import find_delay
+from .head import MOST_UNCERTAIN, Head, HeadMatcher
 from .passage import excited, strong_interval
 from .pattern import Trace
 from .record import Record
 
-LEAST_CORRELATION = 0.6
 AXLE_SPACING = 6.2
 """Track per wheelset of a train on bogies (m), to count how many have passed."""
-_PULSE = 0.25  # m, place of one pulse
 _END_SIGMA = 0.6  # m, place of the last wheelset by the end of strong energy
 _CAR = 26.0  # m, a train shows its next bogie within a car
 
@@ -81,38 +78,27 @@ def provisional(
 def _by_delay(
     a: Record, b: Record, within: tuple[float, float], limits: tuple[float, float]
 ) -> Partial | None:
-    best: Partial | None = None
-    for first, second, (low, high) in zip(
-        a.traces(within), b.traces(within), a.window.bands, strict=False
-    ):
-        found = envelope_delay(first, second, within, limits)
-        if found is None or found[1] < LEAST_CORRELATION:
-            continue
-        delay, correlation = found
-        if best is not None and correlation <= best.score:
-            continue
-        baseline = b.channel.x - a.channel.x
-        speed = baseline / abs(delay)
-        # what both channels have seen of the train
-        later = second if delay > 0 else first
-        interval = strong_interval(later, high - low, within)
-        if interval is None:
-            continue
-        distance = speed * (within[1] - interval[0])
-        wheelsets = max(1.0, distance / AXLE_SPACING)
-        sigma = speed * np.sqrt(2 * (PULSE_PLACE_SIGMA**2 + _PULSE**2 / wheelsets)) / baseline
-        best = Partial(
-            speed,
-            float(sigma),
-            1 if delay > 0 else -1,
-            correlation,
-            distance,
-            int(wheelsets),
-            (a.channel.name, b.channel.name),
-            "delay of the envelope between two rail channels",
-            x=a.channel.x,
-        )
-    return best
+    found = find_delay(a, b, within, limits)
+    if found is None or found.sigma > MOST_UNCERTAIN * found.speed:
+        return None
+    # what both channels have seen of the train
+    later = b if found.direction > 0 else a
+    low, high = later.window.bands[found.band]
+    interval = strong_interval(later.traces(within)[found.band], high - low, within)
+    if interval is None:
+        return None
+    distance = found.speed * (within[1] - interval[0])
+    return Partial(
+        found.speed,
+        found.sigma,
+        found.direction,
+        found.probability,
+        distance,
+        int(max(1.0, distance / AXLE_SPACING)),
+        (a.channel.name, b.channel.name),
+        "delay of waveform and envelope between two rail channels",
+        x=a.channel.x,
+    )
 
 
 def _by_pattern(

@@ -135,7 +135,8 @@ def band_pass(x: Array, fine: float, broad: float) -> Array:
     return out.astype(np.float64)
 
 
-def _clipped(x: Array) -> Array:
+def limited(x: Array) -> Array:
+    """A series cut at :data:`_CLIP` of its rms."""
     limit = _CLIP * float(np.sqrt(np.mean(x * x)))
     return np.clip(x, -limit, limit)
 
@@ -154,7 +155,7 @@ def _features(
 ) -> list[tuple[Array, Array, float]]:
     """The two channels' waveform, then their log-energies per band, each with its width (m)."""
     waves = [
-        _clipped(band_pass(w.cells(e), fine, BROAD)) for w, e in zip(pair.waves, edges, strict=True)
+        limited(band_pass(w.cells(e), fine, BROAD)) for w, e in zip(pair.waves, edges, strict=True)
     ]
     out = [(waves[0], waves[1], fine)]
     width = max(fine, _ENERGY_FINE)
@@ -303,7 +304,7 @@ def _features_under(pair: Pair, motion: Motion, direction: int) -> list[tuple[Ar
     return _features(pair, pair.edges(motion, direction), FINE)
 
 
-def _independent(x: Array, uneven: bool = True) -> float:
+def independent(x: Array, uneven: bool = True) -> float:
     """Independent samples in a series, by its autocorrelation: N / sum r(k)²
 
     (Bartlett's formula for the variance of a correlation; Box & Jenkins, Time Series Analysis,
@@ -322,7 +323,7 @@ def _correlation(a: Array, b: Array) -> float:
     return float(a @ b) / float(np.sqrt(max(float(a @ a) * float(b @ b), 1e-300)))
 
 
-def _residual(a: Array, b: Array) -> Array:
+def residual(a: Array, b: Array) -> Array:
     """What two series of any scale do not share."""
     x, y = (v / max(float(np.sqrt(v @ v)), 1e-150) for v in (a, b))
     return np.asarray(x - y)
@@ -387,9 +388,9 @@ def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> 
 
     grid = [np.array([x, y]) for x in (-6.0, -3, 0, 3, 6) for y in (-6.0, -3, 0, 3, 6)]
     start = min(grid, key=cost)
-    left = [_residual(a, b) for a, b, _ in _features_under(pair, motion_at(start), direction)]
-    weights = _Weights(_independent(left[0]), _independent(left[1]))
-    even = _Weights(_independent(left[0], uneven=False), _independent(left[1], uneven=False))
+    left = [residual(a, b) for a, b, _ in _features_under(pair, motion_at(start), direction)]
+    weights = _Weights(independent(left[0]), independent(left[1]))
+    even = _Weights(independent(left[0], uneven=False), independent(left[1], uneven=False))
     simplex = start + np.array([[0.0, 0.0], [1.5, 0.0], [0.0, 1.5]])
     found = optimize.minimize(
         cost,
