@@ -51,9 +51,7 @@ class Channel:
             )
         number = isinstance(self.x, (int, float, np.number)) and not isinstance(self.x, bool)
         if not number or not abs(self.x) < 1e9:
-            raise InputError(
-                f"channel {self.name!r}: x = {self.x!r} must be a finite position (m)"
-            )
+            raise InputError(f"channel {self.name!r}: x = {self.x!r} must be a finite position (m)")
 
 
 @dataclass(frozen=True)
