@@ -75,8 +75,9 @@ def views_for(factors: dict[str, Any]) -> list[str]:
     listed = factors.get("train") in {train.name for train in Catalogue.default()}
     if plain(factors) and _snr(factors) >= 10:
         views += ONE_RAIL if listed else ONE_RAIL[:1]
-        if listed and _snr(factors) >= 20:
-            views += ["slab, type known", "bridge, type known"]
+        if _snr(factors) >= 20:
+            views += ["slab, type known", "bridge, type known"] if listed else []
+            views += ["bridge"]
     return views
 
 
@@ -301,6 +302,9 @@ class Accuracy:
                 0.3 if layer == "bridge" else None,
                 "%",
             )
+        sure = [p for p in passages("bridge", plain, True, 20) if p.found_type != "unknown"]
+        self._error("speed, bridge alone, nothing known", "a type was named, plain, ≥ 20 dB",
+                    sure, percent, None, "%")  # fmt: skip
         for view, limit in (("rails", 0.6), ("one rail", 2.0)):
             self._error(
                 f"speed of a type absent from the catalogue, {view}",
@@ -396,6 +400,15 @@ class Accuracy:
             lambda p: p.found_type in ("unknown", ""),
             0.98,
         )
+        for condition, listed in (("type in the catalogue", True), ("type absent", False)):
+            self._rate(
+                "family right or said to be unknown, bridge alone",
+                f"{condition}, plain, ≥ 20 dB",
+                [p for p in self._passages("bridge", plain, listed, 20) if p.detected],
+                lambda p: p.found_type in ("unknown", "") or p.found_family == p.family,
+                0.97,
+                lambda p: f"family {p.found_family}",
+            )
         both = [p for p in self._passages("rails", listed=None) if p.detected]
         self._rate(
             "direction",
@@ -463,6 +476,7 @@ class Accuracy:
             "one rail, plain, ≥ 10 dB": self._passages("one rail", plain),
             "two rails, absent types, ≥ 10 dB": self._passages("rails", listed=False),
             "one rail, absent types, ≥ 10 dB": self._passages("one rail", listed=False),
+            "bridge, plain, ≥ 20 dB": self._passages("bridge", plain, None, 20),
         }
         for condition, passages in sets.items():
             for quantity, row in calibration([p for p in passages if p.detected]).items():

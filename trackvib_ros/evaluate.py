@@ -102,6 +102,7 @@ VIEWS: dict[str, View] = {
     "one rail, type known": View(("rail",), 1, "type", 0.5),
     "slab, type known": View(("slab",), 1, "type", 0.5),
     "bridge, type known": View(("bridge",), 1, "type", 0.5),
+    "bridge": View(("bridge",), 1, "nothing", 0.5),
 }
 """By name: what of a bag a detector can be given."""
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, Estimate, TrainEvent, detect
 from trackvib_ros.detection.response import Model, Observation, Spectrum, comb
+from trackvib_ros.detection.unlisted import CAR, EqualCars
 from trackvib_ros.nuisances import RATE, nuisance
 
 Array = NDArray[np.float64]
@@ -185,6 +188,40 @@ def test_stated_sigma_holds_the_error() -> None:
     # sigma allows for misfit that is not white (CORRELATED = 2.5), which is absent here: 0.63
     # expected, and chi-square of ten holds 0.38 to 0.9 in 95 %
     assert 0.3 < rms < 1.0
+
+
+def test_an_unlisted_train_is_told_as_unknown() -> None:
+    """Four equal cars of 23 m: metros of the catalogue repeat nearly alike at another speed."""
+    cars, speed = EqualCars(4, 0.74, 0.11), 30.0
+    axles = 23.0 / CAR[0] * cars.train.axles
+    x = recorded(BEFORE_S + axles / speed, 400.0, ("modes", speed), 0.02, 7)
+    types = Catalogue(tuple(SHIPPED[name] for name in ("metro", "metro_A6")), "two types")
+    event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], types))
+    assert event is not None
+    assert event.values["type"] == "unknown"
+    assert "axle_count" not in event.values
+    assert "unknown_type" in event.quality
+    found = speed_of(event)
+    # its size is not known, but for a fifth; what repeats is
+    assert found.sigma > 0.15 * speed
+    assert abs(found.value - speed) < 2 * found.sigma
+    rate = estimate(event, "car_rate")
+    assert rate.value == pytest.approx(speed / 23.0, rel=5e-3)
+
+
+def test_two_types_of_one_shape_are_equally_likely() -> None:
+    """The second is the first enlarged by 1 %: nothing on a bridge can tell them apart."""
+    metro = SHIPPED["metro"]
+    other = replace(metro, name="other", axle_positions=tuple(1.01 * metro.axles))
+    times = wheelset_times("metro", 40.0)
+    x = recorded(times, 400.0, ("modes", 40.0), 0.1, 8)
+    event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], Catalogue((metro, other))))
+    assert event is not None
+    chances = dict(event.values["types"])  # type: ignore[arg-type]
+    # all but the range of speeds is the same, and that favours none
+    assert 0.2 < chances["metro"] < 0.8
+    found = speed_of(event)
+    assert abs(found.value - 40.0) < 2 * found.sigma
 
 
 @pytest.mark.parametrize("kind", ["hammer", "rain", "spikes", "hum"])

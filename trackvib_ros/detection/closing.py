@@ -16,7 +16,7 @@ from .events import Channel, Estimate, TrainEvent, Value
 from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import departed
-from .passage import Passage, excited, find_listed, find_passages
+from .passage import Passage, excited, find_passages
 from .record import Record
 from .response import find_response
 
@@ -77,10 +77,6 @@ class Closing:
     def search(self, records: Sequence[Record], within: tuple[float, float]) -> list[Passage]:
         """Every train that the rail channels show in an interval (s)."""
         return find_passages(records, within, self._catalogue, self._limits, self.calibration)
-
-    def listed(self, records: Sequence[Record], within: tuple[float, float]) -> Passage | None:
-        """The one train of a listed type that several rail channels show in an interval (s)."""
-        return find_listed(records, within, self._catalogue, self._limits, self.calibration)
 
     def conclude(self, ended: Ended) -> list[TrainEvent]:
         """The events at the end of an event; what its trains teach is kept."""

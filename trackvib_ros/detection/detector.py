@@ -386,12 +386,13 @@ class TrainDetector:
         origin = event.start_ns - _BEFORE_NS
         end = (strong[latest] - origin) * 1e-9
         within = ((event.start_ns - origin) * 1e-9 - 0.5, end)
-        found = self._closing.listed(self._rails(origin, now_ns), within)
-        # without a delay, half a train is a type at another speed
-        if found is None or found.direction == 0 or not found.score > _CLEAR:
+        found = self._closing.search(self._rails(origin, now_ns), within)
+        if not found or not all(p.known and p.confirmed and p.score > _CLEAR for p in found):
             return False
-        best, traces = found.hypotheses[0], found.traces
-        way = max(found.direction * (trace.x - traces[0].x) for trace in traces)
+        best, traces = found[-1].hypotheses[0], found[-1].traces
+        if found[-1].direction == 0:  # without a delay, half a train is a type at another speed
+            return False
+        way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
         last = float(best.fit.motion.time_at(best.places[-1] + way))
         clear = _LULL_MARGIN * self.catalogue.longest_gap / float(best.fit.motion.speed_at(last))
         if not last - clear < end < last + clear:

@@ -322,7 +322,6 @@ def find_passage(
     trains: Sequence[TrainType],
     limits: tuple[float, float],
     site: Calibration,
-    unlisted: bool = True,
 ) -> Passage | None:
     """The train in an interval of time, from its rail channels (reference = first by score).
 
@@ -332,7 +331,6 @@ def find_passage(
         trains: candidate types.
         limits: lowest and highest speed (m/s).
         site: where the channels are.
-        unlisted: whether to describe what no type explains.
     """
     scanned = [
         found
@@ -353,7 +351,7 @@ def find_passage(
     else:
         passage = _fit_hypotheses(usable, trains, limits, site)
     off = bool(passage.clock_offset)
-    if not unlisted or (passage.known and not (off and passage.score < CLOCK_SCORE)):
+    if passage.known and not (off and passage.score < CLOCK_SCORE):
         return passage
     guess = None
     if passage.hypotheses:
@@ -611,21 +609,6 @@ def find_passages(
     return _divided(rails, within, whole, catalogue, limits, site, depth=3)
 
 
-def find_listed(
-    records: Sequence[Record],
-    within: tuple[float, float],
-    catalogue: Catalogue,
-    limits: tuple[float, float],
-    site: Calibration,
-) -> Passage | None:
-    """The one train of a listed type whose pattern two rail channels or more show in an event."""
-    rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
-    if len(rails) < 2:
-        return None
-    found = find_passage(rails, within, catalogue.types, limits, site, unlisted=False)
-    return found if found is not None and found.known and not found.clock_offset else None
-
-
 def apart(first: Passage, second: Passage) -> float:
     """Distance (m) of the first wheelset of a train behind the last one of the train before it."""
     end, start, speed = first.interval[1], second.interval[0], np.inf
@@ -649,22 +632,17 @@ def _divided(
     gaps = quiet_gaps(trace, whole.band[1] - whole.band[0], within, 0.6)
     if whole.score > 0.8 or depth == 0:
         return [whole]
-    # a part in which something travels gives the whole most of its delay
-    unlisted = whole.known or (whole.blind is not None and whole.blind.direction != 0)
     for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
-        parts: list[Passage] = []
+        parts = []
         for half in halves:
-            part = find_passage(rails, half, catalogue.types, limits, site, unlisted)
+            part = find_passage(rails, half, catalogue.types, limits, site)
             if part is None or not part.confirmed:
                 break
             parts.append(part)
         better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1
         if better and apart(parts[0], parts[1]) > catalogue.longest_gap:
-            if not unlisted and not all(part.known for part in parts):
-                tried = [find_passage(rails, h, catalogue.types, limits, site) for h in halves]
-                parts = [part for part in tried if part is not None]
             return [
                 found
                 for half, part in zip(halves, parts, strict=True)

@@ -16,6 +16,7 @@ from .live import Partial
 from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage
 from .record import Record
 from .response import CONFIRM_EVIDENCE, ResponsePassage
+from .unlisted import CAR
 
 Array = NDArray[np.float64]
 
@@ -392,10 +393,10 @@ def response(
     parts = passage.speeds
     own = motion.speed_sigma(motion.epoch)
     half = max(half_interval(parts, best.speed), 1.96 * own)
-    variance = sum(p * ((v - best.speed) ** 2 + s**2) for p, v, s in parts)
-    sigma = max(variance**0.5, own)
+    sigma = half / 1.96
     first, last = (float(motion.time_at(place)) for place in (0.0, train.span))
-    edge = float(np.hypot(passage.middle[1], 0.5 * train.span / best.speed * sigma / best.speed))
+    # the passing time is known better than speed and length, which scale alike
+    edge = float(np.hypot(passage.middle[1], 0.5 * train.span / best.speed * passage.relative))
     named = sum(
         p for p, f in zip(passage.probabilities, passage.fits, strict=True) if f.train is train
     )
@@ -408,6 +409,8 @@ def response(
     names = tuple(channel.name for channel in passage.channels)
     method = "one common response per wheelset, least squares"
     quality = ["axles_not_visible", "speed_scales_with_type"]
+    if not passage.known:
+        quality.append("unknown_type")
     for record in records:
         inside = (record.window.time >= first) & (record.window.time <= last)
         if record.channel.name in names and inside.any():
@@ -433,26 +436,39 @@ def response(
         "arrival_sigma": edge,
         "departure_ns": stamp(last),
         "departure_sigma": edge,
-        "passing_time": Estimate(duration, duration * sigma / best.speed, "s"),
+        "passing_time": Estimate(duration, duration * passage.relative, "s"),
         "speed": Estimate(best.speed, sigma, "m/s"),
         "speed_interval": tuple(round(v, 6) for v in (best.speed - half, best.speed + half)),
         "speed_at": "middle of the train at the reference point",
-        "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
         "direction": _DIRECTION[passage.direction],
-        "axle_count": train.axles.size,
-        "axle_count_of": "the type",
-        "type": train.name,
-        "type_probability": round(named, 4),
-        "types": ranked(listed),
-        "families": ranked(grouped),
-        "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
-        "cars": train.cars,
-        "units": _UNITS.get(train.units, str(train.units)),
+        "type": "unknown",
+        "unknown_probability": round(passage.unknown, 4),
+        "cars": "unknown",
+        "units": "unknown",
         "train_length": Estimate(train.length, train.length * sigma / best.speed, "m"),
         "evidence": round(best.evidence, 1),
-        "speed_passing_time": Estimate(*passage.by_duration, "m/s"),
         "catalogue": catalogue.version,
     }
+    if passage.known:
+        values |= {
+            "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
+            "axle_count": train.axles.size,
+            "axle_count_of": "the type",
+            "type": train.name,
+            "type_probability": round(named, 4),
+            "types": ranked(listed),
+            "families": ranked(grouped),
+            "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
+            "cars": train.cars,
+            "units": _UNITS.get(train.units, str(train.units)),
+            "speed_passing_time": Estimate(*passage.by_duration, "m/s"),
+        }
+    else:
+        own = float(np.sqrt(motion.covariance[2, 2]))
+        bend = float(np.hypot(own, CAR[1] * motion.acceleration))
+        values["acceleration"] = Estimate(motion.acceleration, bend, "m/s^2")
+        cars = best.speed / CAR[0]
+        values["car_rate"] = Estimate(cars, cars * passage.relative, "Hz")
     if passage.spectral is not None:
         values["speed_spectrum"] = Estimate(*passage.spectral, "m/s")
     confidence = float(np.clip(1 - CONFIRM_EVIDENCE / (2 * best.evidence), 0.0, 0.99))

@@ -26,8 +26,10 @@ from scipy import fft
 
 from .catalogue import TrainType
 from .events import Channel
+from .evidence import PRIOR_UNKNOWN
 from .kinematics import PRIOR_ACCELERATION, Motion
 from .record import Record
+from .unlisted import ALTERNATIVES, CAR, CHOICES, EqualCars, starts
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -42,6 +44,11 @@ CERTAIN_EVIDENCE = 100.0
 CORRELATED = 2.5
 """Misfit is not white: its neighbouring coefficients go together, so that this many count as one.
 Mean square of error over sigma of the speed on computed passages when counted as independent."""
+
+_SYSTEMATIC = 0.03
+"""Share of the evidence by which models of like trains differ because none is exact, in units of
+one e-fold of belief: of 27 computed passages of a metro two had the nearest other metro, and five a
+train of somewhat other proportions, more than a fifth better than itself."""
 
 _MARGIN_S = 1.5  # on either side of the strong energy
 _FADE_S = 0.3
@@ -74,6 +81,8 @@ _BLUR = 0.4  # of the evidence, what a coarse grid and an unknown misfit may cos
 _CLEAR = 20.0  # evidence of a motion without acceleration
 _MOST = 10  # hypotheses that are followed
 _PEAKS = 5  # of a type and orientation
+_CARS = (30.0, 13.5)  # m, longest and shortest cars, at the lowest and the highest speed
+_HALF = 0.12  # ln of speed, half the range of a train of equal cars: half of one car of four
 
 
 def smoothed(values: Array, width: int) -> Array:
@@ -144,7 +153,7 @@ def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexA
 
     Args:
         places: of the wheelsets behind the middle (m).
-        f: frequencies (Hz).
+        f: frequencies (Hz), equal steps.
         speed, acceleration: as the middle passes (m/s, m/s²), shape (motions,).
 
     Returns:
@@ -153,10 +162,15 @@ def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexA
     v, a = speed[:, None], acceleration[:, None]
     root = np.sqrt(np.maximum(v * v + 2 * a * places, 0.01 * v * v))
     times = 2 * places / (v + root)
-    total = np.zeros((speed.size, f.size), dtype=np.complex128)
-    for passing in times.T:
-        total += np.exp(-2j * np.pi * np.outer(passing, f))
-    return total
+    # frequency i + block j is a product of two phases: far fewer exponentials, and a matrix product
+    block = max(1, round(float(np.sqrt(f.size))))
+    blocks = -(-f.size // block)
+    step = (f[-1] - f[0]) / max(f.size - 1, 1)
+    inner = np.exp(-2j * np.pi * times[:, None, :] * (step * np.arange(block))[:, None])
+    outer = np.exp(
+        -2j * np.pi * times[:, None, :] * (f[0] + step * block * np.arange(blocks))[:, None]
+    )
+    return np.asarray((outer @ inner.swapaxes(1, 2)).reshape(speed.size, -1)[:, : f.size])
 
 
 @dataclass(frozen=True)
@@ -192,8 +206,9 @@ class Model:
         weight = 2 * s.share / self._variance()
         lags = np.cos(2 * np.pi * np.outer(s.f, t - t[0]))
         column = (np.abs(combs) ** 2 * (weight * shape**2)) @ lags
-        phase = np.exp(2j * np.pi * np.outer(s.f, (t[:, None] + centres).ravel()))
-        right = np.real((np.conj(combs) * (weight * shape * s.y)) @ phase)
+        knots = np.exp(2j * np.pi * np.outer(s.f, t))
+        phase = knots[:, :, None] * np.exp(2j * np.pi * np.outer(s.f, centres))[:, None, :]
+        right = np.real((np.conj(combs) * (weight * shape * s.y)) @ phase.reshape(s.f.size, -1))
         order = np.abs(np.subtract.outer(np.arange(t.size), np.arange(t.size)))
         return column[:, order] + np.eye(t.size), right.reshape(len(combs), t.size, centres.size)
 
@@ -369,10 +384,16 @@ class _Search:
         """Of trial motions, stated at the common epoch, for observation ``k``."""
         return comb(places, model.spectrum.f, v + a * (self.seen[k].epoch - self.epoch), a)
 
-    def coarse(self, train: TrainType, reverse: bool, bent: bool = True) -> list[ResponseFit]:
+    def coarse(
+        self,
+        train: TrainType,
+        reverse: bool,
+        bent: bool = True,
+        spread: tuple[float, float] = _RANGE,
+    ) -> list[ResponseFit]:
         """The best motions of a type on waves from :data:`_COARSE`."""
         expected = _PASSED * train.span / self.duration
-        speeds = expected * np.exp(np.arange(*_RANGE, _NEIGHBOUR * _COARSE / train.span))
+        speeds = expected * np.exp(np.arange(*spread, _NEIGHBOUR * _COARSE / train.span))
         speeds = speeds[(speeds >= self.limits[0]) & (speeds <= self.limits[1])]
         if not speeds.size:
             return []
@@ -508,6 +529,81 @@ class _Search:
             models.append(trials[int(np.argmax(values))])
         return replace(fit, models=tuple(models))
 
+    def shared(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        """Every fit with the models of whichever fit suit it best, most probable first.
+
+        What one of two like trains has found of a response, the other one must be allowed, too:
+        types must not be told apart by how well a search went.
+        """
+        out = []
+        for fit in fits:
+            models = []
+            for k, own in enumerate(fit.models):
+                trials = {(m.before, m.after, m.misfit): m for m in (f.models[k] for f in fits)}
+                starts = [own.centre, *(m.centre for m in trials.values())]
+                centres = np.unique(np.round(starts, 4))
+                best = -np.inf, own
+                for trial in trials.values():
+                    values = trial.evidence(self._own(k, trial, fit), fit.places.size, centres)[0]
+                    i = int(np.argmax(values))
+                    if values[i] > best[0]:
+                        best = float(values[i]), replace(trial, centre=float(centres[i]))
+                models.append(best[1])
+            moved = self.climb(replace(fit, models=tuple(models)), _FINE, 2)
+            told = self.beside(moved, _FINE)
+            out.append(
+                moved if told.covariance is None else replace(moved, covariance=told.covariance)
+            )
+        return sorted(out, key=lambda fit: -fit.evidence)
+
+    def transferred(
+        self, oriented: Sequence[tuple[TrainType, bool]], fits: Sequence[ResponseFit]
+    ) -> list[ResponseFit]:
+        """Every type in the passing time, and with the models, of the fit that suits it best."""
+        found = []
+        for train, reverse in oriented:
+            best: ResponseFit | None = None
+            for fit in fits:
+                ratio = train.span / fit.train.span
+                near = 1 + 0.12 * _FINE / train.span * np.arange(-4.0, 5.0, 2.0)
+                v, a = ratio * fit.speed * near, np.full(near.size, ratio * fit.acceleration)
+                if not self.limits[0] <= ratio * fit.speed <= self.limits[1]:
+                    continue
+                trial = replace(fit, train=train, reverse=reverse)
+                values = self.total(trial, v, a)
+                i = int(np.argmax(values))
+                if best is None or values[i] > best.evidence:
+                    v_best, a_best, value = float(v[i]), float(a[i]), float(values[i])
+                    best = replace(trial, speed=v_best, acceleration=a_best, evidence=value)
+            if best is not None:
+                found.append(best)
+        found.sort(key=lambda fit: -fit.evidence)
+        return found[:_PEAKS]
+
+    def unlisted(self) -> ResponseFit | None:
+        """The train of equal cars that explains most; its speed is that of cars of 20 m."""
+        sizes = [limit * CAR[0] / length for limit, length in zip(self.limits, _CARS, strict=True)]
+        search = _Search(self.seen, (sizes[0], sizes[1]))
+        found = []
+        for cars in starts():
+            near = search.coarse(cars.train, False, bent=False, spread=(-_HALF, _HALF))
+            found += [(fit, cars) for fit in near[:1]]
+        if not found:
+            return None
+        fit, cars = max(found, key=lambda pair: pair[0].evidence)
+        fit = search.refined(search.coarse(cars.train, False, spread=(-_HALF, _HALF))[:2] or [fit])[
+            0
+        ]
+        for trials in (EqualCars.numbers, EqualCars.proportions, EqualCars.numbers):
+            v = fit.speed * (1 + 0.06 * _FINE / fit.train.span * np.arange(-2.0, 3.0, 2.0))
+            a = np.full(v.size, fit.acceleration)
+            values = []
+            for trial in trials(cars):
+                values.append(float(search.total(replace(fit, train=trial.train), v, a).max()))
+            cars = trials(cars)[int(np.argmax(values))]
+            fit = replace(fit, train=cars.train)
+        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2)
+
     def _own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
         v, a = np.array([fit.speed]), np.array([fit.acceleration])
         return self.combs(k, model, fit.places, v, a)
@@ -532,6 +628,22 @@ class _Search:
         return sorted(fits, key=lambda fit: -fit.evidence)
 
 
+def _distinct(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+    """Fits without those that a better one of the same type repeats."""
+    kept: list[ResponseFit] = []
+    for fit in fits:
+        alike = [f for f in kept if f.train is fit.train and f.reverse == fit.reverse]
+        near = 2 * _NEIGHBOUR * _COARSE / fit.train.span
+        if all(abs(f.speed / fit.speed - 1) > near for f in alike):
+            kept.append(fit)
+    return kept
+
+
+def tempered(evidence: float) -> float:
+    """Difference of evidence that stands for a factor e between two trains."""
+    return CORRELATED + _SYSTEMATIC * max(evidence, 0.0)
+
+
 def _orientations(trains: Sequence[TrainType]) -> list[tuple[TrainType, bool]]:
     return [(t, r) for t in trains for r in ((False,) if t.symmetric else (False, True))]
 
@@ -548,6 +660,7 @@ class ResponsePassage:
         direction: +1, -1, or 0 if unknown.
         duration: between 5 and 95 % of the energy (s).
         spectral: speed by the bogie-passing spectrum (m/s), sigma; or None.
+        unlisted: the train of equal cars that explains most, at the speed of cars of 20 m.
     """
 
     fits: tuple[ResponseFit, ...]
@@ -557,11 +670,31 @@ class ResponsePassage:
     direction: int
     duration: float
     spectral: tuple[float, float] | None
+    unlisted: ResponseFit | None = None
+
+    @property
+    def unknown(self) -> float:
+        """Probability that the train is not in the catalogue.
+
+        By what the best train of equal cars explains more than the best type, less what the choice
+        of its proportions costs.
+        """
+        if self.unlisted is None or not self.fits:
+            return 0.0 if self.fits else 1.0
+        listed = self.fits[0].evidence
+        gain = (self.unlisted.evidence - listed) / tempered(listed)
+        odds = PRIOR_UNKNOWN / (1 - PRIOR_UNKNOWN) / ALTERNATIVES * np.exp(min(gain, 50.0))
+        return float(odds / (1 + odds))
+
+    @property
+    def known(self) -> bool:
+        """Whether a type of the catalogue explains the train as well as any other would."""
+        return self.unknown < 0.5
 
     @property
     def best(self) -> ResponseFit:
-        """The most probable fit."""
-        return self.fits[0]
+        """The most probable fit; of the train of equal cars if the type is not known."""
+        return self.fits[0] if self.known or self.unlisted is None else self.unlisted
 
     @property
     def confirmed(self) -> bool:
@@ -571,9 +704,10 @@ class ResponsePassage:
         quarters of their waveform or of their energy, unless the evidence is overwhelming.
         """
         best = self.best
+        evidence = best.evidence - (0.0 if self.known else CORRELATED * float(np.log(CHOICES)))
         explained = min(model.misfit for model in best.models) <= _USUAL_MISFIT
-        explained |= best.evidence > CERTAIN_EVIDENCE
-        clear = best.evidence > CONFIRM_EVIDENCE and best.covariance is not None
+        explained |= evidence > CERTAIN_EVIDENCE
+        clear = evidence > CONFIRM_EVIDENCE and best.covariance is not None
         return clear and explained and best.alike
 
     @property
@@ -584,8 +718,22 @@ class ResponsePassage:
         if best.covariance is not None:
             covariance[1:, 1:] = CORRELATED * best.covariance
         covariance[0, 0] = (self.middle[1] * best.speed) ** 2
+        if not self.known:
+            covariance[1, 1] += (CAR[1] * best.speed) ** 2
         half = 0.5 * best.train.span
         return Motion(self.middle[0], half, best.speed, best.acceleration, covariance)
+
+    @property
+    def relative(self) -> float:
+        """Relative sigma of the time that the train takes, whatever its size."""
+        best = self.best
+        own = CORRELATED * best.covariance[0, 0] if best.covariance is not None else 0.0
+        variance = float(own) / best.speed**2
+        if self.known:
+            rate = best.speed / best.train.span
+            pairs = zip(self.probabilities, self.fits, strict=True)
+            variance += sum(p * (f.speed / f.train.span / rate - 1) ** 2 for p, f in pairs)
+        return float(np.sqrt(variance))
 
     @property
     def by_duration(self) -> tuple[float, float]:
@@ -595,12 +743,16 @@ class ResponsePassage:
 
     @property
     def speeds(self) -> list[tuple[float, float, float]]:
-        """(probability, speed, sigma) of every fit (m/s)."""
-        return [
-            (p, fit.speed, float(np.sqrt(CORRELATED * fit.covariance[0, 0])))
+        """(probability, speed, sigma) of every fit, and of an unlisted train (m/s)."""
+        listed = 1 - self.unknown
+        parts = [
+            (listed * p, fit.speed, float(np.sqrt(CORRELATED * fit.covariance[0, 0])))
             for p, fit in zip(self.probabilities, self.fits, strict=True)
             if fit.covariance is not None
         ]
+        if self.unlisted is not None:
+            parts.append((self.unknown, self.unlisted.speed, CAR[1] * self.unlisted.speed))
+        return parts
 
 
 def _placed(fit: ResponseFit, k: int) -> tuple[float, float]:
@@ -683,21 +835,36 @@ def find_response(
         return None
     search = _Search(seen, limits)
     coarse = search.scan(oriented)
-    if not coarse or max(fit.evidence for fit in coarse) < 0:
+    listed = search.refined(coarse) if any(fit.evidence > 0 for fit in coarse) else []
+    other = search.unlisted()
+    leaders = [*listed[:2], *([other] if other else [])]
+    listed += search.transferred(oriented, leaders)
+    together = search.shared([*listed, *([other] if other else [])])
+    fits = [fit for fit in together if fit.train in trains]
+    other = next((fit for fit in together if fit.train not in trains), None)
+    if not together or together[0].evidence < 0:
         return None
-    fits = search.refined(coarse)
-    likely = [fit for fit in fits if fit.evidence > fits[0].evidence - _KEPT]
-    weight = np.exp([(fit.evidence - fits[0].evidence) / CORRELATED for fit in likely])
-    placed = [_placed(fits[0], k) for _, k in used]
+    top = fits[0].evidence if fits else 0.0
+    unit = tempered(top)
+    likely = [fit for fit in _distinct(fits) if fit.evidence > top - _KEPT * unit / CORRELATED]
+    weight = np.exp([(fit.evidence - top) / unit for fit in likely])
     channels = tuple(channel for channel, _ in used)
-    return ResponsePassage(
+    told = ResponsePassage(
         tuple(likely),
         tuple(float(w) for w in weight / weight.sum()),
         channels,
-        placed[0],
-        _direction(channels, placed, fits[0].speed),
+        (0.0, 0.0),
+        0,
         search.duration,
-        _spectral(fits[0], used[0][1]),
+        None,
+        other,
+    )
+    placed = [_placed(told.best, k) for _, k in used]
+    return replace(
+        told,
+        middle=placed[0],
+        direction=_direction(channels, placed, told.best.speed) if told.known else 0,
+        spectral=_spectral(told.best, used[0][1]) if told.known else None,
     )
 
 
