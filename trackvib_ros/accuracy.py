@@ -283,6 +283,16 @@ class Accuracy:
             "speed, two rails 20 m apart", "plain, 0 dB",
             passages("rails", lambda f: plain(f) and _snr(f) < 10, True, -99), percent, None, "%"
         )  # fmt: skip
+        early = (("the first bogies", 0, 1.8, 0.5), ("eight wheelsets", 1, 1.3, 0.22))
+        for after, number, most, half in early:
+
+            def told(p: PassageScore, number: int = number) -> float | None:
+                return 100 * p.updates[number][0] if len(p.updates) > number else None
+
+            name = f"provisional speed after {after}, two rails"
+            clear, all_ = (passages("rails", plain, True, least) for least in (20, 10))
+            self._error(name, "plain, ≥ 20 dB", clear, told, most, "%", half)
+            self._error(name, "plain, ≥ 10 dB", all_, told, None, "%")
         for view, limit in zip(ONE_RAIL, (None, 0.9, 0.4), strict=True):
             name = "nothing known" if view == "one rail" else view.removeprefix("one rail, ")
             self._error(

@@ -123,6 +123,8 @@ class PassageScore:
         axle_square, axle_inside, axle_scored: sum of (error / sigma)², number within 1.96 sigma,
             number of wheelsets found whose time has a sigma.
         axles_told: number of axle events; ``axles_found`` is the count that the passage states.
+        updates: (error, sigma) of every speed told while the train passed, in order; against the
+            true speed halfway between its first wheelset and the update.
     """
 
     bag: str
@@ -157,6 +159,7 @@ class PassageScore:
     axle_inside: int = 0
     axle_scored: int = 0
     latency_s: float | None = None
+    updates: tuple[tuple[float, float], ...] = ()
     quality: tuple[str, ...] = ()
 
     @property
@@ -403,6 +406,7 @@ def match_events(
     summaries = [(t, e) for t, e in summaries if e.values.get("grade") != VIBRATION]
     arrivals = [(t, e) for t, e in told if e.kind == "arrival"]
     axles = [e for _, e in told if e.kind == "axle"]
+    updates = [e for _, e in told if e.kind == "update"]
     taken: set[int] = set()
     explained: set[int] = set()
     margin = round(ALARM_S * 1e9)
@@ -419,6 +423,8 @@ def match_events(
         if own and passage.detected:
             passage.onset_s = (own[0][1].stamp_ns - first) * 1e-9
             passage.declared_s = (own[0][0] - first) * 1e-9
+        own_updates = [e for e in updates if first < e.stamp_ns < last]
+        passage.updates = _score_updates(own_updates, truth, first, scenario)
         if passage.latency_s is not None:
             passage.latency_s -= last * 1e-9
         before = last
@@ -490,6 +496,23 @@ def _score_passage(
         passage.acceleration_sigma = acceleration.sigma
     _score_axles(passage, event, axles, np.array(times_ns) * 1e-9)
     return passage
+
+
+def _score_updates(
+    updates: Sequence[TrainEvent], truth: PassageTruth, first_ns: int, scenario: Scenario | None
+) -> tuple[tuple[float, float], ...]:
+    """Relative error and sigma of the speeds told while a train passes."""
+    motion = TrainMotion(scenario.train[truth.train - 1]) if scenario is not None else None
+    out = []
+    for event in updates:
+        speed = event.values.get("speed")
+        if not isinstance(speed, Estimate):
+            continue
+        true = float(np.mean(list(truth.speed_m_s.values())))
+        if motion is not None:
+            true = float(motion.speed(np.array([0.5e-9 * (first_ns + event.stamp_ns)]))[0])
+        out.append((speed.value / true - 1, speed.sigma / true))
+    return tuple(out)
 
 
 def _score_axles(

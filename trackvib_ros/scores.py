@@ -44,6 +44,7 @@ def calibration(found: Sequence[PassageScore]) -> dict[str, dict[str, float]]:
         "acceleration": ratios([(p.acceleration_error, p.acceleration_sigma) for p in found]),
         "arrival": ratios([(p.arrival_s, p.arrival_sigma_s) for p in found]),
         "departure": ratios([(p.departure_s, p.departure_sigma_s) for p in found]),
+        "provisional speed": ratios([update for p in found for update in p.updates]),
     }
     table = {
         name: {
@@ -99,6 +100,7 @@ def summary(result: Evaluation) -> dict[str, Any]:
         "departure_error_ms": spread([p.departure_s for p in found], 1e3),
         "latency_s": spread([p.latency_s for p in found]),
         "speed_error_percent": spread([p.speed_error for p in found], 100.0),
+        "provisional_speed_error_percent": spread([e for p in found for e, _ in p.updates], 100.0),
         "acceleration_error_m_s2": spread([p.acceleration_error for p in found]),
         "calibration": calibration(found),
         "axle_count_right": _part([p.axles_found == p.axles_true for p in found]),

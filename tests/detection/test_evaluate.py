@@ -501,3 +501,10 @@ def test_dataset_is_resumed_scored_and_made_again(tmp_path):
     command = [sys.executable, "-c", main, "dataset", "--again", bag, "-o", again]
     subprocess.run(command, check=True)
     assert bytes_of(again) == bytes_of(bag)
+
+
+def test_speeds_told_while_passing_are_scored_in_order():
+    told_at = [(10.1, 1.02), (10.3, 0.99), (11.5, 3.0)]  # the last one after the train
+    updates = [told("update", t, speed=Estimate(f * SPEED, 0.5, "m/s")) for t, f in told_at]
+    (passage,) = scored([*updates, passage_event()], [truth()]).passages
+    np.testing.assert_allclose(passage.updates, [(0.02, 0.5 / SPEED), (-0.01, 0.5 / SPEED)])

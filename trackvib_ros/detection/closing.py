@@ -36,6 +36,7 @@ class Ended:
         within: onset and last activity (s after ``origin_ns``), with margins.
         now_ns: end of the records.
         last_ns: last activity.
+        found: its trains, if they are known already.
         begun: the rail channels from the start of the stream on, and that start (ns), if a train
             was near then; else ``None``.
     """
@@ -45,6 +46,7 @@ class Ended:
     within: tuple[float, float]
     now_ns: int
     last_ns: int
+    found: list[Passage] | None = None
     begun: tuple[list[Record], int] | None = None
 
 
@@ -81,7 +83,7 @@ class Closing:
     def conclude(self, ended: Ended) -> list[TrainEvent]:
         """The events at the end of an event; what its trains teach is kept."""
         records, within = ended.records, ended.within
-        found = self.search(records, within)
+        found = self.search(records, within) if ended.found is None else ended.found
         if ended.begun is not None:
             rails, start_ns = ended.begun
             if not _whole(found, (start_ns - ended.origin_ns) * 1e-9):

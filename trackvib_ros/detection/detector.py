@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from heapq import heappop, heappush
 
@@ -18,11 +18,13 @@ from .calibration import POSITION_SIGMA, Calibration
 from .catalogue import Catalogue
 from .closing import Closing, Ended
 from .events import Channel, TrainEvent
-from .group import Group
+from .group import LEAST_BINS, Group
 from .head import HeadMatcher
+from .kinematics import Motion
 from .live import Partial, provisional
 from .occupancy import Occupancy
 from .onset import GAINS
+from .passage import Passage
 from .record import Record
 
 Array = NDArray[np.float64]
@@ -35,6 +37,7 @@ _RISE = 10.0  # a train on rails that still ring
 _LULL_NS = 250_000_000  # least quiet time after which a train may be past
 _LULL_FACTOR = 1.3  # over its longest lull so far
 _LULL_MARGIN = 1.15  # over the longest gap of wheelsets in the catalogue
+_CHANGE = 0.02  # of the speed between the first wheelsets and the middle of a train
 _UPDATE_NS = 200_000_000
 _UPDATE_GROWTH = 0.25  # of the time passed, between trials
 _UPDATE_AFTER = (8.0, 45.0)  # m of the train: its first bogies, its first eight wheelsets
@@ -83,13 +86,35 @@ class DetectorConfig:
 
 
 @dataclass
+class _Past:
+    """Trains of known types that have passed every rail channel, or will have soon.
+
+    Attributes:
+        found: the trains.
+        last_ns: end of what they explain.
+        clear_ns: by channel, when no further wheelset of theirs can come.
+        next_ns: by channel, when something came after that.
+    """
+
+    found: list[Passage]
+    last_ns: int
+    clear_ns: dict[int, int]
+    next_ns: dict[int, int]
+
+
+@dataclass
 class _Event(Occupancy):
     """An event, with what was told and tried since its onset."""
 
     next_update_ns: int = 0
     updates: int = 0
     trial_ns: int = 0
-    past_ns: int | None = None
+    tried: dict[int, tuple[int, int | None]] | None = None
+    speed: tuple[float, float] | None = None
+    """By the delay between two channels (m/s), sigma: owes nothing to a pattern."""
+    past: _Past | None = None
+    after: dict[int, int] = field(default_factory=dict)
+    """By channel, when an earlier train had passed it (ns)."""
 
 
 class TrainDetector:
@@ -345,7 +370,7 @@ class TrainDetector:
             level = float(group.trigger.level[local])
             if self._event is not None:
                 if self._event.follow(channel, float(group.trigger.steady[local]), now_ns):
-                    self._event.past_ns = None
+                    self._followed(self._event, channel, now_ns)
             elif self._fresh(channel, level, now_ns):
                 continue  # not yet an onset
             self._active_ns[channel] = now_ns
@@ -362,43 +387,93 @@ class TrainDetector:
             for other in self._groups.values():
                 other.relearn()
         elif self._past(self._event, now_ns):
-            events += self._close(now_ns, max(self._event.strong().values()))
+            events += self._pass_on(self._event, now_ns)
         elif now_ns >= self._event.next_update_ns and self._event.updates < len(_UPDATE_AFTER):
             events += self._update(self._event, now_ns)
         return events
 
     def _past(self, event: _Event, now_ns: int) -> bool:
-        """Whether a train of a known type has passed whole, before the quiet time is over.
+        """Whether trains of known types have passed whole, before the quiet time is over.
 
-        Its pattern explains all that was strong, and at its speed a further wheelset of any type
-        would have come by now. Another train may follow soon.
+        On every rail channel: their pattern explains all that was strong, and at their speed a
+        further wheelset of any type would have come. Another train may follow soon, or be on a
+        channel already.
         """
-        if event.past_ns is not None:
-            return now_ns >= event.past_ns
-        strong = event.strong()
-        if not strong or now_ns < event.trial_ns:
-            return False
-        latest = max(strong, key=lambda c: strong[c])
-        lull = now_ns - strong[latest]
-        if lull < max(_LULL_NS, _LULL_FACTOR * event.lull_ns[latest]):
-            return False
-        event.trial_ns = now_ns + lull // 2
+        if event.past is None and now_ns >= event.trial_ns:
+            event.past = self._trial(event, now_ns)
+        return event.past is not None and now_ns >= max(event.past.clear_ns.values())
+
+    def _clear_s(self, speed: float) -> float:
+        """Time within which the next wheelset of a train comes, whatever its type (s)."""
+        return _LULL_MARGIN * self.catalogue.longest_gap / speed
+
+    def _trial(self, event: _Event, now_ns: int) -> _Past | None:
+        quiet = event.quiet(now_ns)
+        if len(quiet) < 2:  # without a delay, half a train is a type at another speed
+            return None
+        if event.speed is not None:
+            speed, sigma = event.speed
+            wait = 1e9 * self._clear_s(speed + 2 * sigma)
+        else:
+            latest = max(quiet, key=lambda c: event.strong_ns[c])
+            before, after = event.lull_ns[latest]
+            wait = max(_LULL_NS, _LULL_FACTOR * (after - before))
+        if any((end or now_ns) - start < wait for start, end in quiet.values()):
+            return None
+        if quiet == event.tried:
+            return None
+        lasting = [now_ns - start for start, end in quiet.values() if end is None]
+        event.trial_ns = now_ns + max(lasting, default=0) // 2
+        event.tried = None if lasting else quiet
         origin = event.start_ns - _BEFORE_NS
-        end = (strong[latest] - origin) * 1e-9
-        within = ((event.start_ns - origin) * 1e-9 - 0.5, end)
-        found = self._closing.search(self._rails(origin, now_ns), within)
-        if not found or not all(p.known and p.confirmed and p.score > _CLEAR for p in found):
-            return False
-        best, traces = found[-1].hypotheses[0], found[-1].traces
-        if found[-1].direction == 0:  # without a delay, half a train is a type at another speed
-            return False
-        way = max(found[-1].direction * (trace.x - traces[0].x) for trace in traces)
-        last = float(best.fit.motion.time_at(best.places[-1] + way))
-        clear = _LULL_MARGIN * self.catalogue.longest_gap / float(best.fit.motion.speed_at(last))
-        if not last - clear < end < last + clear:
-            return False
-        event.past_ns = max(now_ns, origin + round((last + clear) * 1e9))
-        return now_ns >= event.past_ns
+        ends = {
+            c: now_ns if end is None else start + round(wait) for c, (start, end) in quiet.items()
+        }
+        last_ns = max(start for start, _ in quiet.values())
+        within = (event.start_ns - origin) * 1e-9 - 0.5, (last_ns - origin) * 1e-9 + 0.3
+        rails = [r for r in self._records(event, origin, now_ns, ends) if r.channel.layer == "rail"]
+        found = self._closing.search(rails, within)
+        if not found or not all(p.known and p.confirmed for p in found):
+            return None
+        train, best = found[-1], found[-1].hypotheses[0]
+        if train.direction == 0 or not (
+            min(p.score for p in found) > _CLEAR or _agree(event.speed, best.fit.motion)
+        ):
+            return None
+        past = _Past(found, last_ns, {}, {})
+        for c, (start, end) in quiet.items():
+            way = train.direction * (self.channels[c].x - train.traces[0].x)
+            last = float(best.fit.motion.time_at(best.places[-1] + way))
+            clear = self._clear_s(float(best.fit.motion.speed_at(last)))
+            past.clear_ns[c] = origin + round((last + clear) * 1e9)
+            if abs((start - origin) * 1e-9 - last) > clear:
+                return None
+            if end is not None:
+                if end < past.clear_ns[c]:
+                    return None
+                past.next_ns[c] = end
+        return past
+
+    def _followed(self, event: _Event, channel: int, now_ns: int) -> None:
+        """A channel is strong: what was taken for past is not, unless this is the next train."""
+        if event.past is None or self.channels[channel].layer != "rail":
+            return
+        if now_ns < event.past.clear_ns.get(channel, 2**62):
+            event.past = None
+        else:
+            event.past.next_ns.setdefault(channel, now_ns)
+
+    def _pass_on(self, event: _Event, now_ns: int) -> list[TrainEvent]:
+        """Tell the trains that are past; what came after them is an event of its own."""
+        past = event.past
+        assert past is not None
+        events = self._close(now_ns, past)
+        if self._replay or not past.next_ns:
+            return events
+        channel = min(past.next_ns, key=lambda c: past.next_ns[c])
+        self._event = _Event(self.channels, past.next_ns[channel], after=past.clear_ns)
+        self._event.next_update_ns = now_ns + _UPDATE_NS
+        return [*events, report.arrival(self.channels[channel], past.next_ns[channel], GAINS[0])]
 
     def _fresh(self, channel: int, level: float, now_ns: int) -> bool:
         """Whether the activity of a channel is new, not what an earlier train left ringing."""
@@ -410,7 +485,7 @@ class TrainDetector:
         levels = zip(group.index, group.trigger.level, strict=True)
         return np.array([self._fresh(channel, float(level), now_ns) for channel, level in levels])
 
-    def _close(self, now_ns: int, last_ns: int | None = None) -> list[TrainEvent]:
+    def _close(self, now_ns: int, past: _Past | None = None) -> list[TrainEvent]:
         event = self._event
         assert event is not None
         self._event = None
@@ -421,7 +496,7 @@ class TrainDetector:
                 return []
         self._lowest[:] = np.inf
         origin = event.start_ns - _BEFORE_NS
-        last = event.last() if last_ns is None else last_ns
+        last = event.last() if past is None else past.last_ns
         within = (
             (event.start_ns - origin) * 1e-9 - 0.5,
             (last - origin) * 1e-9 + 0.3,
@@ -429,13 +504,36 @@ class TrainDetector:
         begun = None
         if self._inside:
             start = self._start_ns or 0
-            begun, self._inside = (self._rails(start, now_ns), start), False
-        records = self._records(origin, now_ns)
-        return self._closing.conclude(Ended(records, origin, within, now_ns, last, begun))
+            begun, self._inside = (self._rails(event, start, now_ns), start), False
+        ends = {c: past.clear_ns[c] for c in past.next_ns} if past else {}
+        records = self._records(event, origin, now_ns, ends)
+        found = past.found if past else None
+        return self._closing.conclude(Ended(records, origin, within, now_ns, last, found, begun))
 
-    def _records(self, from_ns: int, to_ns: int) -> list[Record]:
-        groups = self._groups.values()
-        return [r for g in groups for r in g.records(self.channels, from_ns, to_ns)]
+    def _records(
+        self, event: _Event, from_ns: int, to_ns: int, ends: Mapping[int, int] | None = None
+    ) -> list[Record]:
+        """What the channels show in an interval of an event.
+
+        Args:
+            event: some channels show it only after an earlier train.
+            from_ns: start (ns).
+            to_ns: end (ns).
+            ends: of some channels, where a later train comes (ns).
+        """
+        records = [
+            r for g in self._groups.values() for r in g.records(self.channels, from_ns, to_ns)
+        ]
+        if not event.after and not ends:
+            return records
+        parts = []
+        for record in records:
+            c = self._index[record.channel.name]
+            span = event.after.get(c, from_ns), (ends or {}).get(c, to_ns)
+            part = record.between(*((t - from_ns) * 1e-9 for t in span))
+            if part.window.time.size > LEAST_BINS:
+                parts.append(part)
+        return parts
 
     def _update(self, event: _Event, now_ns: int) -> list[TrainEvent]:
         passed = now_ns - event.start_ns
@@ -444,18 +542,28 @@ class TrainDetector:
             return []
         origin = event.start_ns - _BEFORE_NS
         within = ((event.start_ns - origin) * 1e-9 - 0.5, (now_ns - origin) * 1e-9)
-        found = provisional(self._rails(origin, now_ns), within, self._limits, self._heads)
+        found = provisional(self._rails(event, origin, now_ns), within, self._limits, self._heads)
         if found is None or not _enough(found, event.updates):
             return []
         event.updates += 1
+        if found.direction:
+            event.speed = found.speed, found.sigma
         return [report.update(found, now_ns)]
 
     @cached_property
     def _heads(self) -> HeadMatcher:
         return HeadMatcher(self.catalogue.types, self._limits)
 
-    def _rails(self, from_ns: int, to_ns: int) -> list[Record]:
-        return [r for r in self._records(from_ns, to_ns) if r.channel.layer == "rail"]
+    def _rails(self, event: _Event, from_ns: int, to_ns: int) -> list[Record]:
+        return [r for r in self._records(event, from_ns, to_ns) if r.channel.layer == "rail"]
+
+
+def _agree(speed: tuple[float, float] | None, motion: Motion) -> bool:
+    """Whether a speed (m/s, sigma) is that of a motion."""
+    if speed is None:
+        return False
+    told = motion.speed_at(motion.epoch)
+    return bool(abs(speed[0] - told) < 2 * np.hypot(speed[1], _CHANGE * told))
 
 
 def _enough(found: Partial, updates: int) -> bool:

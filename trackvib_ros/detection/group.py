@@ -14,7 +14,7 @@ from .record import Record
 
 Array = NDArray[np.float64]
 
-_LEAST_BINS = 50  # of a record that tells anything
+LEAST_BINS = 50  # of a record that tells anything
 
 
 class Group:
@@ -107,6 +107,6 @@ class Group:
         for local, channel in enumerate(self.index):
             window = self.stream.window(local, from_ns, to_ns)
             floor = self.trigger.floor[local]
-            if window.time.size > _LEAST_BINS and np.isfinite(floor).all():
+            if window.time.size > LEAST_BINS and np.isfinite(floor).all():
                 out.append(Record(channels[channel], window, floor.copy()))
         return out

@@ -25,7 +25,7 @@ class Occupancy:
         last_ns: when a wheelset was last near.
         pause_ns: longest time between two of these so far.
         strong_ns: when the level was last strong.
-        lull_ns: longest time between two of these so far.
+        lull_ns: the longest stretch between two of these so far, its start and its end.
     """
 
     channels: tuple[Channel, ...]
@@ -33,7 +33,7 @@ class Occupancy:
     last_ns: dict[int, int] = field(default_factory=dict)
     pause_ns: dict[int, int] = field(default_factory=dict)
     strong_ns: dict[int, int] = field(default_factory=dict)
-    lull_ns: dict[int, int] = field(default_factory=dict)
+    lull_ns: dict[int, tuple[int, int]] = field(default_factory=dict)
     _strongest: dict[int, float] = field(default_factory=dict)
     _least: dict[int, float] = field(default_factory=dict)
 
@@ -50,8 +50,9 @@ class Occupancy:
         self._strongest[channel], self._least[channel] = strongest, least
         strong = level > _STRONG * strongest
         if strong:
-            lull = now_ns - self.strong_ns.get(channel, now_ns)
-            self.lull_ns[channel] = max(lull, self.lull_ns.get(channel, 0))
+            lull = self.strong_ns.get(channel, now_ns), now_ns
+            longest = self.lull_ns.get(channel, lull)
+            self.lull_ns[channel] = max(longest, lull, key=lambda span: span[1] - span[0])
             self.strong_ns[channel] = now_ns
         near = strong or level > max(_FADED * strongest, _RISEN * least)
         if near or _FADED * strongest < 1:
@@ -64,6 +65,17 @@ class Occupancy:
     def strong(self) -> dict[int, int]:
         """When each rail channel was last strong (ns)."""
         return {c: t for c, t in self.strong_ns.items() if self.channels[c].layer == "rail"}
+
+    def quiet(self, now_ns: int) -> dict[int, tuple[int, int | None]]:
+        """Where each rail channel was without strong energy for longest, from when to when (ns).
+
+        ``None`` for the end of a stretch that still lasts.
+        """
+        spans: dict[int, tuple[int, int | None]] = {}
+        for c, latest in self.strong().items():
+            start, end = self.lull_ns[c]
+            spans[c] = (start, end) if end - start > now_ns - latest else (latest, None)
+        return spans
 
     def last(self) -> int:
         """Last activity of the layer nearest to the wheels (ns): a bridge rings on for seconds."""

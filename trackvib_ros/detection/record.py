@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,14 @@ class Record:
     channel: Channel
     window: Window
     floor: Array
+
+    def between(self, start: float, stop: float) -> Record:
+        """The part between two times (s)."""
+        window = self.window
+        part = slice(*(int(i) for i in np.searchsorted(window.time, [start, stop])))
+        names = ("time", "energy", "low", "peak", "flat", "valid", "holes")
+        kept = {name: getattr(window, name)[part] for name in names}
+        return replace(self, window=replace(window, **kept))
 
     def traces(self, within: tuple[float, float], limited: bool = False) -> list[Trace]:
         """One trace per band, quiet outside an interval (s); levels ``limited`` on request."""

@@ -171,10 +171,12 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
     margin = _MARGIN_S
     if passage.known:
         best = passage.hypotheses[0]
-        start, stop = (float(best.fit.motion.time_at(best.places[i])) for i in (0, -1))
         margin = _MARGIN / float(best.fit.motion.speed_at(best.mid_time))
     for record in records:
         window = record.window
+        if passage.known:
+            way = passage.direction * (record.channel.x - passage.traces[0].x)
+            start, stop = (float(best.fit.motion.time_at(best.places[i] + way)) for i in (0, -1))
         inside = (window.time >= start) & (window.time <= stop)
         if record.channel.layer != "rail" or not inside.any():
             continue
