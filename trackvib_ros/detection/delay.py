@@ -179,7 +179,7 @@ class _Trial:
         most = int(baseline * self.centre / span[0] / _STEP) + self.reach + 1
         self.lags = np.arange(-most, most + 1)
         levels = [
-            [band_pass(t.level(edges[:-1], edges[1:]), _ENERGY_FINE, _ENERGY_BROAD) for t in pair]
+            [band_pass(t.levels(edges), _ENERGY_FINE, _ENERGY_BROAD) for t in pair]
             for pair in zip(*traces, strict=True)
         ]
         self.wave = _Signals(

@@ -115,7 +115,7 @@ class HeadMatcher:
             if count < 16:
                 continue
             edges = start + (np.arange(count + 1) * _CELL - _BEFORE) / speed
-            level = trace.level(edges[:-1], edges[1:])
+            level = trace.levels(edges)
             level = np.convolve(np.pad(level, 4, mode="edge"), self._kernel, mode="valid")
             level = level - level.mean()
             own = float(level @ level)

@@ -322,6 +322,7 @@ def find_passage(
     trains: Sequence[TrainType],
     limits: tuple[float, float],
     site: Calibration,
+    unlisted: bool = True,
 ) -> Passage | None:
     """The train in an interval of time, from its rail channels (reference = first by score).
 
@@ -331,6 +332,7 @@ def find_passage(
         trains: candidate types.
         limits: lowest and highest speed (m/s).
         site: where the channels are.
+        unlisted: whether to describe what no type explains.
     """
     scanned = [
         found
@@ -351,7 +353,7 @@ def find_passage(
     else:
         passage = _fit_hypotheses(usable, trains, limits, site)
     off = bool(passage.clock_offset)
-    if passage.known and not (off and passage.score < CLOCK_SCORE):
+    if not unlisted or (passage.known and not (off and passage.score < CLOCK_SCORE)):
         return passage
     guess = None
     if passage.hypotheses:
@@ -632,17 +634,22 @@ def _divided(
     gaps = quiet_gaps(trace, whole.band[1] - whole.band[0], within, 0.6)
     if whole.score > 0.8 or depth == 0:
         return [whole]
+    # a part in which something travels gives the whole most of its delay
+    unlisted = whole.known or (whole.blind is not None and whole.blind.direction != 0)
     for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
-        parts = []
+        parts: list[Passage] = []
         for half in halves:
-            part = find_passage(rails, half, catalogue.types, limits, site)
+            part = find_passage(rails, half, catalogue.types, limits, site, unlisted)
             if part is None or not part.confirmed:
                 break
             parts.append(part)
         better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1
         if better and apart(parts[0], parts[1]) > catalogue.longest_gap:
+            if not unlisted and not all(part.known for part in parts):
+                tried = [find_passage(rails, h, catalogue.types, limits, site) for h in halves]
+                parts = [part for part in tried if part is not None]
             return [
                 found
                 for half, part in zip(halves, parts, strict=True)

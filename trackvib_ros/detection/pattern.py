@@ -28,7 +28,35 @@ _COARSE = 1.8  # m, smoothing of the first pass
 _COARSE_BEND = 2.0  # m
 _SPEED_STEP = 0.016
 _CELL = 0.5  # m
+_EVEN = 1e-3  # of a bin, equal
 _BACKGROUND = 8.0  # m, what is smoother than this is no axle pattern
+
+
+class Integral:
+    """A quantity that is constant in every bin, integrated up to any time.
+
+    Args:
+        edges: of the bins (s), shape (bins + 1,).
+        value: in the bins, shape (bins,).
+    """
+
+    def __init__(self, edges: Array, value: Array) -> None:
+        self._edges = edges
+        self._rise = np.append(value * np.diff(edges), 0.0)
+        self._sum = np.concatenate([[0.0], np.cumsum(self._rise[:-1])])
+        # stamps are whole ns: bins are equal but for that, unless a long gap lies between them
+        step = float(edges[-1] - edges[0]) / value.size if value.size else 0.0
+        even = edges[0] + step * np.arange(edges.size)
+        self._rate = 1 / step if step > 0 and np.max(np.abs(edges - even)) < _EVEN * step else None
+
+    def __call__(self, time: Array) -> Array:
+        """Integral from the first edge to times (s); constant outside the bins."""
+        if self._rate is None:
+            return np.asarray(np.interp(time, self._edges, self._sum))
+        place = (np.asarray(time) - self._edges[0]) * self._rate
+        place = np.clip(place, 0.0, self._edges.size - 1.0)
+        bins = place.astype(np.intp)
+        return np.asarray(self._sum[bins] + (place - bins) * self._rise[bins])
 
 
 class Trace:
@@ -75,37 +103,41 @@ class Trace:
         self.base = max(floor, strong / DYNAMIC_RANGE, 1e-300)
         # a stream with a gap of several seconds has unequal bins: integrate over real time
         edges = np.concatenate([time - step / 2, time[-1:] + step / 2])
-        widths = np.diff(edges)
-        self._edges = edges
-        self._sum = np.concatenate([[0.0], np.cumsum(filled * widths)])
-        self._limited = self._sum
+        self._ends = float(edges[0]), float(edges[-1])
+        self._energy = self._limited = Integral(edges, filled)
         if limited and known.size:
             typical = max(float(np.quantile(filled[known], _TYPICAL)), self.base)
-            self._limited = np.concatenate([[0.0], np.cumsum(np.minimum(filled, typical) * widths)])
-        self._known = np.concatenate([[0.0], np.cumsum(valid * widths)])
+            self._limited = Integral(edges, np.minimum(filled, typical))
+        self._known = Integral(edges, valid.astype(np.float64))
 
     def mean(self, start: Array, stop: Array) -> Array:
         """Mean energy between two times (s); :attr:`noise` outside the record."""
-        return self._mean(self._sum, start, stop)
+        return self._over(self._energy(stop) - self._energy(start), start, stop)
 
-    def _mean(self, sums: Array, start: Array, stop: Array) -> Array:
-        total = np.interp(stop, self._edges, sums) - np.interp(start, self._edges, sums)
-        low, high = self._edges[0], self._edges[-1]
-        length = np.clip(stop, low, high) - np.clip(start, low, high)
+    def _over(self, total: Array, start: Array, stop: Array) -> Array:
+        length = np.clip(stop, *self._ends) - np.clip(start, *self._ends)
         return np.where(length > 0, total / np.maximum(length, 1e-12), self.noise)
+
+    def _level(self, mean: Array) -> Array:
+        return np.log(np.maximum(mean / self.base, 1.0))
 
     def level(self, start: Array, stop: Array) -> Array:
         """ln of the mean energy over :attr:`base`, not below 0."""
-        return np.log(np.maximum(self.mean(start, stop) / self.base, 1.0))
+        return self._level(self.mean(start, stop))
 
-    def pattern_level(self, start: Array, stop: Array) -> Array:
-        """The level in which patterns are looked for, limited if so asked."""
-        return np.log(np.maximum(self._mean(self._limited, start, stop) / self.base, 1.0))
+    def levels(self, edges: Array) -> Array:
+        """The level between successive times (s) along the last axis."""
+        total = np.diff(self._energy(edges))
+        return self._level(self._over(total, edges[..., :-1], edges[..., 1:]))
+
+    def pattern_levels(self, edges: Array) -> Array:
+        """The levels in which patterns are looked for, limited if so asked."""
+        total = np.diff(self._limited(edges))
+        return self._level(self._over(total, edges[..., :-1], edges[..., 1:]))
 
     def coverage(self, start: Array, stop: Array) -> Array:
         """Fraction of an interval that was measured."""
-        total = np.interp(stop, self._edges, self._known)
-        total = total - np.interp(start, self._edges, self._known)
+        total = self._known(stop) - self._known(start)
         return np.asarray(total / np.maximum(stop - start, 1e-12))
 
 
@@ -158,7 +190,7 @@ def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: 
     reachable = square > 0.01 * v * v
     root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
     times = epoch + 2 * edges / (v + root)
-    level = trace.pattern_level(times[:, :-1], times[:, 1:])
+    level = trace.pattern_levels(times)
     return np.asarray(np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0))
 
 

@@ -22,7 +22,7 @@ from scipy import fft, optimize
 
 from .features import Window
 from .kinematics import MAX_ACCELERATION, PRIOR_ACCELERATION, Motion
-from .pattern import Trace
+from .pattern import Integral, Trace
 
 Array = NDArray[np.float64]
 
@@ -85,12 +85,12 @@ class Series:
         if known.size:
             value = np.interp(np.arange(value.size), known, value[known])
         middle = 0.5 * (time[1:] + time[:-1])
-        self._edges = np.concatenate([[time[0]], middle, [time[-1]]])
-        self._sum = np.concatenate([[0.0], np.cumsum(value * np.diff(self._edges))])
+        ends = 1.5 * time[[0, -1]] - 0.5 * time[[1, -2]]
+        self._integral = Integral(np.concatenate([ends[:1], middle, ends[1:]]), value)
 
     def cells(self, edges: Array) -> Array:
         """Means between successive times (s); 0 outside the record."""
-        total = np.diff(np.interp(edges, self._edges, self._sum))
+        total = np.diff(self._integral(edges))
         return np.asarray(total / np.maximum(np.diff(edges), 1e-12))
 
 
@@ -161,7 +161,7 @@ def _features(
     width = max(fine, _ENERGY_FINE)
     for first, second in zip(*pair.traces, strict=True):
         levels = [
-            band_pass(trace.level(e[:-1], e[1:]), width, _ENERGY_BROAD)
+            band_pass(trace.levels(e), width, _ENERGY_BROAD)
             for trace, e in zip((first, second), edges, strict=True)
         ]
         out.append((levels[0], levels[1], width))

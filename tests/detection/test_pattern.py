@@ -1,0 +1,33 @@
+"""Energies over any interval of time."""
+
+import numpy as np
+import pytest
+
+from trackvib_ros.detection.pattern import Integral, Trace
+
+
+@pytest.mark.parametrize("gap", [0.0, 7.0])
+def test_integral_of_bins(gap):
+    rng = np.random.default_rng(1)
+    # stamps in whole ns, a step that is none; with and without a gap between bins
+    edges = np.round(1e9 * np.arange(2001) / 1023.7) * 1e-9 + np.where(
+        np.arange(2001) > 900, gap, 0
+    )
+    value = rng.chisquare(2, 2000)
+    exact = np.concatenate([[0.0], np.cumsum(value * np.diff(edges))])
+    at = rng.uniform(edges[0] - 1, edges[-1] + 1, (3, 500))
+    # linear between edges; equal bins are taken as such, 1 ns of 1 ms away from their edges
+    np.testing.assert_allclose(
+        Integral(edges, value)(at), np.interp(at, edges, exact), rtol=1e-6, atol=2e-8
+    )
+
+
+def test_levels_of_successive_intervals():
+    rng = np.random.default_rng(2)
+    time = 0.001 * np.arange(3000)
+    trace = Trace("a", 0.0, time, rng.chisquare(2, 3000), np.ones(3000, bool), 0.1, 0.001)
+    edges = np.linspace(-0.2, 3.3, 80)
+    np.testing.assert_allclose(
+        trace.levels(edges), trace.level(edges[:-1], edges[1:]), rtol=1e-9, atol=1e-12
+    )
+    np.testing.assert_array_equal(trace.pattern_levels(edges), trace.levels(edges))
