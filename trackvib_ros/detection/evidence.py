@@ -23,6 +23,7 @@ from scipy.special import ndtr
 
 from .axles import AxleFit
 from .kinematics import PRIOR_ACCELERATION, Motion
+from .place import Wave, agreement
 
 Array = NDArray[np.float64]
 Kind: TypeAlias = Literal["type", "scaled", "varied", "clock"]
@@ -66,6 +67,7 @@ class Candidate:
         fit: to all channels.
         score: of its pattern.
         site: covariance of the shifts (m²).
+        waves: low-passed waveforms of the channels.
     """
 
     places: Array
@@ -73,6 +75,7 @@ class Candidate:
     fit: AxleFit
     score: float
     site: Array
+    waves: tuple[Wave, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -158,8 +161,8 @@ def _model(
     speed: float,
     effects: Sequence[Array],
     seen: NDArray[np.bool_],
-) -> tuple[float, Motion]:
-    """Log evidence against wheelsets anywhere, and the motion.
+) -> tuple[float, Motion, Array]:
+    """Log evidence against wheelsets anywhere, the motion, and the mean of every effect.
 
     Args:
         candidate: the type.
@@ -195,7 +198,32 @@ def _model(
         start.acceleration + float(change[2]),
         np.linalg.inv(normal),
     )
-    return log, motion
+    return log, motion, np.asarray(z.T @ (solved[:, 3] - solved[:, :3] @ change))
+
+
+def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float) -> float:
+    """Log likelihood of the low-passed waveforms if the wheelsets have these places (m).
+
+    All is scaled to one common speed (m/s), that types of one shape but another size are asked
+    about the same waves.
+    """
+    fit = candidate.fit
+    scale = speed / float(motion.speed_at(motion.time_at(0.5 * places[-1])))
+    motion = Motion(
+        motion.epoch,
+        scale * motion.distance,
+        scale * motion.speed,
+        scale * motion.acceleration,
+        motion.covariance,
+    )
+    places = scale * places
+    ahead = [
+        places + float(np.median((motion.distance_at(time) - places)[seen]))
+        if seen.any()
+        else places
+        for time, seen in zip(fit.time, fit.observed, strict=True)
+    ]
+    return agreement(candidate.waves, motion, ahead).log
 
 
 def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
@@ -232,17 +260,20 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
         noisy = np.where(c.fit.observed, c.fit.residual, 0.0)
         square = float(c.places @ c.places)
         rounded = np.round(np.diff(c.places), 1)
-        counts = []
-        for gap in np.unique(rounded):
-            before = np.concatenate([[0.0], np.cumsum(rounded == gap)])
-            share = float(before @ c.places) / square
-            counts.append((float(gap), before[None, :] - share * noisy))
-        along = c.places[None, :] - noisy
-        scaled = [_SCALE * along, *(_SHAPE * n for _, n in counts)]
-        varied = [
-            _SCALE_VARIED * along,
-            *((_GAP_NEAR if gap < _NEAR else _GAP_FAR) * n for gap, n in counts),
-        ]
+        gaps = np.unique(rounded)
+        before = [np.concatenate([[0.0], np.cumsum(rounded == gap)]) for gap in gaps]
+        # what a relative differs by, per metre of its size and of every gap
+        differs = np.stack([c.places, *before])
+        follow = [row - float(row @ c.places) / square * noisy for row in differs]
+        near = np.where(gaps < _NEAR, _GAP_NEAR, _GAP_FAR)
+        spread: dict[Kind, Array] = {
+            "scaled": np.array([_SCALE, *np.full(gaps.size, _SHAPE)]),
+            "varied": np.array([_SCALE_VARIED, *near]),
+        }
+        scaled, varied = (
+            [s * f for s, f in zip(spread[kind], follow, strict=True)]
+            for kind in ("scaled", "varied")
+        )
         unlisted = float(np.log(PRIOR_UNKNOWN / 2))
         coarse = unlisted - _COARSE_COST * min(1.0, noise / _COARSE)
         prior = float(-np.log(len(candidates))) - _SCORE_WEIGHT * max(
@@ -257,10 +288,20 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             effect = np.zeros((channels, axles))
             effect[k] = _CLOCK_S * abs(c.fit.motion.speed)
             trials.append(("clock", k, float(np.log(PRIOR_CLOCK)), [effect]))
+        as_listed: float | None = None
         for kind, channel, log_prior, more in trials:
-            log, motion = _model(c, noise, speed, [*base, *more], use)
-            if motion.speed > 0:
-                found.append((log + prior + log_prior, index, kind, channel, motion))
+            log, motion, mean = _model(c, noise, speed, [*base, *more], use)
+            if motion.speed <= 0:
+                continue
+            if kind in spread:
+                bend = (spread[kind] * mean[len(base) :]) @ differs
+                phase = _in_phase(c, motion, c.places + bend, speed)
+            else:
+                # a wrong clock moves a channel as a whole, which the pulse takes up
+                if as_listed is None:
+                    as_listed = _in_phase(c, motion, c.places, speed)
+                phase = as_listed
+            found.append((log + phase + prior + log_prior, index, kind, channel, motion))
     if not found:
         return []
     logs = np.array([f[0] for f in found])

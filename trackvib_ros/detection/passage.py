@@ -442,7 +442,8 @@ def _fit_hypotheses(
             continue
         fitted.append(Hypothesis(match.train, match.reverse, direction, score, fit))
     fitted = _same_times(fitted, aligned)
-    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance) for h in fitted]
+    waves = tuple(s.wave for s, _ in kept)
+    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance, waves) for h in fitted]
     explanations = explain(candidates)
     if explanations and explanations[0].kind == "clock":
         wrong = kept[explanations[0].channel][0]

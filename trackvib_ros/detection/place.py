@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,9 @@ _COUPLINGS = np.arange(0.0, 3.01, 0.5)  # Hz, edges of the AC coupling of accele
 _REACH = 1.3  # m
 _SHIFTS = np.arange(-_REACH, _REACH + 0.01, 0.02)
 _SAMPLES = 2.5  # per wavelength at least
+_PULSE = np.arange(-2.0, 2.01, 0.5)  # m about a wheelset; as dense as the shortest wave asks for
+_BANDS, _ROUNDS = 8, 5
+_CHANGE = 0.3  # m, within which the motion is known already
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
 DEFLECTION_SIGMA = 0.015
@@ -94,27 +98,13 @@ def likelihood(wave: Wave, motion: Motion, places: Array) -> Array:
         Zero everywhere if the channel shows nothing of the train.
     """
     flat = np.zeros((_COUPLINGS.size, _SHIFTS.size))
-    start, length = float(places[0]), float(places[-1] - places[0])
-    middle = 0.5 * (start + places[-1])
-    speed = float(motion.speed_at(motion.time_at(middle)))
-    found = _against_distance(wave, _from(motion, start), length)
-    if found is None:
+    spectrum = _spectrum(wave, motion, places)
+    if spectrum is None:
         return flat
-    cells, measured = found
-    size = fft.next_fast_len(4 * cells.size // 3, real=True)
-    k = 2 * np.pi * fft.rfftfreq(size, _STEP)
-    spacing = float(np.median(np.diff(wave.time)))
-    top = min(_WAVENUMBERS[1], 2 * np.pi / (_SAMPLES * spacing * speed))
-    use = (k >= _WAVENUMBERS[0]) & (k <= top)
-    if use.sum() < 8:
-        return flat
-    k = k[use]
-    origin = -_TAPER + 0.5 * _STEP
-    seen = fft.rfft(cells, size)[use] * np.exp(-1j * k * origin)
+    k, seen, independent = spectrum
+    speed = _mid_speed(motion, places)
     energy = float(np.sum(np.abs(seen) ** 2))
-    if energy <= 0:
-        return flat
-    comb = np.exp(-1j * np.outer(k, places - start)).sum(axis=1)
+    comb = np.exp(-1j * np.outer(k, places - places[0])).sum(axis=1)
     shape = comb * k**2 / (1 + (k / _STIFFNESS) ** 4)
     frequency = k * speed / (2 * np.pi)
     lead = 1j * frequency / (1j * frequency + _COUPLINGS[:, None])
@@ -122,9 +112,109 @@ def likelihood(wave: Wave, motion: Motion, places: Array) -> Array:
     template /= np.sqrt(np.sum(np.abs(template) ** 2, axis=1, keepdims=True))
     turned = np.exp(1j * np.outer(k, _SHIFTS))
     projection = np.real((np.conj(template) * seen) @ turned)
-    independent = cells.size * _STEP * (k[-1] - k[0]) / (2 * np.pi) * measured
     left = np.maximum(1 - projection**2 / energy, _LEAST)
     return np.asarray(-independent * np.log(left))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well one pulse, whatever its shape, repeated by every wheelset explains the waveforms.
+
+    Attributes:
+        log: likelihood (ln) against noise; 0 if no channel shows anything of the train.
+        change: what the wheelsets lie beyond their expected places (m): the part that grows by one
+            from the middle of the train to its end, and half the part that grows with its square.
+        covariance: of the change (m²).
+    """
+
+    log: float
+    change: Array
+    covariance: Array
+
+
+def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) -> Agreement:
+    """Whether the distances between the wheelsets of a train are right.
+
+    Noise has an unknown level in every band of wavenumbers, for a bridge answers to some. The
+    pulse, real and within 2 m of its wheelset, and a change of the motion are fitted by least
+    squares weighted accordingly (Gauss-Newton): with the part q of a band's energy that is left of
+    n independent wavenumbers the likelihood is the product of q^-n. Coupling, foundation, layer
+    and a place of the channel that is off by less are in the pulse.
+
+    Args:
+        waves: per channel.
+        motion: of the train.
+        places: of its wheelsets (m), per channel, as for :func:`likelihood`.
+    """
+    spectra = [
+        (found, at)
+        for w, at in zip(waves, places, strict=True)
+        if (found := _spectrum(w, motion, at))
+    ]
+    change, covariance, log = np.zeros(2), np.diag([_CHANGE**2] * 2), 0.0
+    if not spectra:
+        return Agreement(log, change, covariance)
+    weights = [np.ones(k.size) for (k, _, _), _ in spectra]
+    shapes: list[Array] = []
+    for round_ in range(_ROUNDS):
+        information, right, log = np.diag([_CHANGE**-2] * 2), -change / _CHANGE**2, 0.0
+        for c, ((k, seen, independent), at) in enumerate(spectra):
+            along = 2 * (at - at[0]) / (at[-1] - at[0]) - 1
+            bend = np.stack([along, 0.5 * along**2])
+            phases = np.exp(-1j * np.outer(k, at - at[0] + change @ bend))
+            pulse = np.exp(-1j * np.outer(_PULSE, k))
+            taps = pulse * phases.sum(axis=1)
+            weight = weights[c]
+            normal = np.real((taps.conj() * weight) @ taps.T)
+            normal += 1e-9 * np.trace(normal) * np.eye(_PULSE.size)
+            shape = np.linalg.solve(normal, np.real((taps.conj() * weight) @ seen))
+            rest = seen - shape @ taps
+            for band in np.array_split(np.arange(k.size), _BANDS):
+                energy = max(float(np.sum(np.abs(seen[band]) ** 2)), 1e-300)
+                left = max(float(np.sum(np.abs(rest[band]) ** 2)), _LEAST * energy)
+                count = independent * band.size / k.size
+                log += count * float(np.log(energy / left))
+                weight[band] = 2 * count / left
+            slope = (shape @ pulse) * -1j * k * (bend @ phases.T)
+            cross = np.real((taps.conj() * weight) @ slope.T)
+            normal = np.real((taps.conj() * weight) @ taps.T)
+            normal += 1e-9 * np.trace(normal) * np.eye(_PULSE.size)
+            pulled = np.linalg.solve(
+                normal, np.column_stack([cross, np.real((taps.conj() * weight) @ rest)])
+            )
+            information += np.real((slope.conj() * weight) @ slope.T) - cross.T @ pulled[:, :2]
+            right += np.real((slope.conj() * weight) @ rest) - cross.T @ pulled[:, 2]
+        covariance = np.linalg.inv(information)
+        if round_ < _ROUNDS - 1:
+            change = change + np.clip(covariance @ right, -_CHANGE, _CHANGE)
+    return Agreement(log, change, covariance)
+
+
+def _mid_speed(motion: Motion, places: Array) -> float:
+    return float(motion.speed_at(motion.time_at(0.5 * (places[0] + places[-1]))))
+
+
+def _spectrum(wave: Wave, motion: Motion, places: Array) -> tuple[Array, Any, float] | None:
+    """Wavenumbers (rad/m) about those of the deflection, the transform of the waveform there with
+    distances from the first wheelset on, and how many of them are independent."""
+    start, length = float(places[0]), float(places[-1] - places[0])
+    found = _against_distance(wave, _from(motion, start), length)
+    if found is None:
+        return None
+    cells, measured = found
+    size = fft.next_fast_len(4 * cells.size // 3, real=True)
+    k = 2 * np.pi * fft.rfftfreq(size, _STEP)
+    spacing = float(np.median(np.diff(wave.time)))
+    top = min(_WAVENUMBERS[1], 2 * np.pi / (_SAMPLES * spacing * _mid_speed(motion, places)))
+    use = (k >= _WAVENUMBERS[0]) & (k <= top)
+    if use.sum() < 8:
+        return None
+    k = k[use]
+    origin = -_TAPER + 0.5 * _STEP
+    seen = fft.rfft(cells, size)[use] * np.exp(-1j * k * origin)
+    if not np.any(seen):
+        return None
+    return k, seen, cells.size * _STEP * (k[-1] - k[0]) / (2 * np.pi) * measured
 
 
 def _from(motion: Motion, start: float) -> Motion:
