@@ -6,18 +6,28 @@ from scipy import signal
 
 from trackvib_ros.detection import Catalogue
 from trackvib_ros.detection.kinematics import Motion
-from trackvib_ros.detection.place import Wave, likelihood, locate
+from trackvib_ros.detection.place import Wave, agreement, likelihood, locate
 
 AXLES = Catalogue.default()["CRH3"].axles
 RATE = 1000.0
 
 
-def wave(speed, error, noise, seed, beta=1.0, coupling=0.0, sign=1.0, acceleration=0.0):
+def wave(
+    speed,
+    error,
+    noise,
+    seed,
+    beta=1.0,
+    coupling=0.0,
+    sign=1.0,
+    acceleration=0.0,
+    axles=AXLES,
+):
     """Pulses of a beam on an elastic foundation, ``error`` m behind the expected places."""
     rng = np.random.default_rng(seed)
     motion = Motion(4.0, 0.0, speed, acceleration, np.eye(3))
     time = np.arange(0.0, 8.0 + 1.3 * AXLES[-1] / speed, 1 / RATE)
-    x = beta * np.abs(motion.distance_at(time)[:, None] - AXLES - error)
+    x = beta * np.abs(motion.distance_at(time)[:, None] - axles - error)
     value = sign * np.sum(np.exp(-x) * (np.cos(x) - np.sin(x)), axis=1)
     if coupling:
         taps = signal.butter(1, coupling, "highpass", fs=RATE)
@@ -72,3 +82,40 @@ def test_a_channel_without_samples_keeps_its_prior():
     shift, sigma = locate(tables, np.array([0.5, 0.07]))
     assert shift == pytest.approx([0.3, 0.0], abs=0.02)
     assert sigma[0] < 0.05 and 0.1 < sigma[1] < 0.25
+
+
+def test_the_motion_is_corrected_with_the_stated_covariance():
+    ratios = []
+    half = 0.5 * AXLES[-1]
+    for seed in range(30):
+        rng = np.random.default_rng(2000 + seed)
+        speed, noise = rng.uniform(15.0, 90.0), rng.uniform(0.05, 0.5)
+        given, motion = wave(speed, rng.uniform(-0.3, 0.3), noise, seed, coupling=1.0)
+        true = rng.uniform(-0.1, 0.1, 2)
+        along = AXLES / half - 1
+        expected = AXLES - true[0] * along - 0.5 * true[1] * along**2
+        found = agreement([given], motion, [expected])
+        ratios.append(np.linalg.solve(np.linalg.cholesky(found.covariance), found.change - true))
+    # 60 numbers: the rms of unit normals lies within 1 +- 3 / sqrt(120)
+    assert 0.73 < np.sqrt(np.mean(np.square(ratios))) < 1.27
+
+
+def test_trains_that_differ_by_centimetres_are_told_apart_as_surely_as_is_said():
+    """CRH2 shrunk to the length of a CRH3 has bogies 3 cm nearer each other."""
+    twin = Catalogue.default()["CRH2"].axles
+    kinds = (AXLES, twin * AXLES[-1] / twin[-1])
+    right, probability = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(3000 + seed)
+        true = seed % 2
+        # at the least noise they are told apart at five sigma, at the most hardly at all
+        noise = 10.0 ** rng.uniform(-2.0, 0.5)
+        given, motion = wave(60.0, 0.1, noise, seed, axles=kinds[true])
+        odds = np.diff([agreement([given], motion, [places]).log for places in kinds])[0]
+        probability.append(1 / (1 + np.exp(-odds * (1 if true else -1))))
+        right.append(probability[-1] > 0.5)
+    said = np.maximum(probability, 1 - np.array(probability))
+    # the number of right answers scatters by the root of the sum of p (1 - p)
+    spread = np.sqrt(np.sum(said * (1 - said)))
+    assert abs(np.sum(right) - np.sum(said)) < 3 * spread
+    assert np.sum(right) > 45 and np.mean(said) > 0.75

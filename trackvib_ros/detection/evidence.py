@@ -39,7 +39,7 @@ PRIOR_CLOCK = 1e-4
 _CLASS_SIGMA = 0.03
 _ALIKE = 0.1  # m, gaps that differ by less are the same
 _FAR = 12.0  # m, neighbours that do not matter
-_LEAST_NOISE = 0.02  # m, geometric tolerance of a train
+_LEAST_NOISE = 0.005  # m, a wheelset is timed in cells of 0.1 m: finer agreement is chance
 _SCALE = 0.04  # catalogue types of one shape differ this much in size (CRH1 : CR400AF 6 %)
 _SCALE_VARIED = 0.08
 _SHAPE = 0.06  # m, how well the gaps of such relatives agree after scaling
@@ -67,7 +67,7 @@ class Candidate:
         fit: to all channels.
         score: of its pattern.
         site: covariance of the shifts (m²).
-        waves: low-passed waveforms of the channels.
+        waves: low-passed waveforms of the channels; without any they do not count.
     """
 
     places: Array
@@ -207,6 +207,8 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
     All is scaled to one common speed (m/s), that types of one shape but another size are asked
     about the same waves.
     """
+    if not candidate.waves:
+        return 0.0
     fit = candidate.fit
     scale = speed / float(motion.speed_at(motion.time_at(0.5 * places[-1])))
     motion = Motion(
@@ -235,7 +237,7 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     # classes of few wheelsets understate it
     noise = max(min(_noise(c) for c in likely), _LEAST_SHARE * min(c.fit.scale for c in likely))
     speed = max(likely, key=lambda c: c.score).fit.motion.speed
-    found: list[tuple[float, int, Kind, int, Motion]] = []
+    found: list[tuple[float, float, int, Kind, int, Motion]] = []
     for index, c in enumerate(candidates):
         channels, axles = c.fit.observed.shape
         common = _comparable(c, likely, noise)
@@ -301,15 +303,17 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
                 if as_listed is None:
                     as_listed = _in_phase(c, motion, c.places, speed)
                 phase = as_listed
-            found.append((log + phase + prior + log_prior, index, kind, channel, motion))
+            found.append((log + prior + log_prior, phase, index, kind, channel, motion))
     if not found:
         return []
-    logs = np.array([f[0] for f in found])
+    # some unlisted train explains the waveforms as well as any model that was tried
+    best_phase = max(f[1] for f in found)
+    logs = np.array([f[0] + (best_phase if f[3] in ("scaled", "varied") else f[1]) for f in found])
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     out = [
         Explanation(index, kind, float(w), motion, channel)
-        for w, (_, index, kind, channel, motion) in zip(weights, found, strict=True)
+        for w, (_, _, index, kind, channel, motion) in zip(weights, found, strict=True)
     ]
     return sorted(out, key=lambda e: -e.probability)
 

@@ -117,15 +117,15 @@ def regress(
     epoch: float,
     prior_acceleration: float = PRIOR_ACCELERATION,
     position_sigma: float = PULSE_PLACE_SIGMA,
-    least_scale: float = 0.02,
+    least_scale: float = 0.005,
 ) -> Fit:
     """Huber regression of ``place`` (m) on ``time`` (s), points of several channels together.
 
     Every channel but the first has an offset with prior N(0, 2 position_sigma²): a rail answers a
     wheel a few centimetres before or after it, according to where the sensor is in its bay. The
     acceleration has the prior N(0, prior_acceleration²). Priors enter as observations. The
-    covariance is scaled by the weighted residual variance, never below ``least_scale`` (m), the
-    geometric tolerance of a train.
+    covariance is scaled by the weighted residual variance, which the geometric tolerance of a train
+    is part of, never below ``least_scale`` (m): agreement finer than that is chance.
     """
     t = time - epoch
     groups = np.unique(channel)[1:]

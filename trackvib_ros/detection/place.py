@@ -155,7 +155,6 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
     if not spectra:
         return Agreement(log, change, covariance)
     weights = [np.ones(k.size) for (k, _, _), _ in spectra]
-    shapes: list[Array] = []
     for round_ in range(_ROUNDS):
         information, right, log = np.diag([_CHANGE**-2] * 2), -change / _CHANGE**2, 0.0
         for c, ((k, seen, independent), at) in enumerate(spectra):

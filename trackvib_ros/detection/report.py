@@ -255,9 +255,10 @@ def _train(
     def stamp(time: float) -> int:
         return origin_ns + round(time * 1e9)
 
-    # a train is built more regularly than a pulse in noise is placed: mostly the motion tells where
-    # the wheelsets of a known type are
-    trust = _GEOMETRY**2 / (_GEOMETRY**2 + fit.scale**2) if passage.known else 1.0
+    # of the variance of a wheelset about its place the train itself has an unknown share, none to
+    # all that its tolerance allows; with half the largest share trusted the error has the variance
+    # trust (1 - trust) scale² on average, at a largest share of one whatever the true one is
+    trust = 0.5 * min(1.0, (_GEOMETRY / fit.scale) ** 2) if passage.known else 1.0
     predicted = motion.time_at(places)
     if passage.known:
         late = -fit.residual[0] / np.maximum(motion.speed_at(predicted), 0.5)
@@ -266,7 +267,7 @@ def _train(
     else:
         late = fit.time[0] - predicted
     axle_times = predicted + np.where(fit.used[0], trust * late, 0.0)
-    scatter = float(np.sqrt(trust) * fit.scale)
+    scatter = float(np.sqrt(trust * (1 - trust)) * fit.scale) if passage.known else fit.scale
     # under an unknown type: where its pulse is, whatever the size of the train
     direct = float(np.sqrt(fit.place_sigma[0] ** 2 + fit.scale**2 + _WHEELBASE**2))
     events: list[TrainEvent] = []
