@@ -225,7 +225,8 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
         else places
         for time, seen in zip(fit.time, fit.observed, strict=True)
     ]
-    return agreement(candidate.waves, motion, ahead).log
+    # wheelsets that only rattle have no such pulse
+    return float(np.logaddexp(0.0, agreement(candidate.waves, motion, ahead).log))
 
 
 def explain(candidates: Sequence[Candidate]) -> list[Explanation]:

@@ -121,7 +121,8 @@ class Agreement:
     """How well one pulse, whatever its shape, repeated by every wheelset explains the waveforms.
 
     Attributes:
-        log: likelihood (ln) against noise; 0 if no channel shows anything of the train.
+        log: likelihood (ln) against noise with all pulses weighed, negative if noise explains the
+            waveforms as well; 0 if no channel shows anything of the train.
         change: what the wheelsets lie beyond their expected places (m): the part that grows by one
             from the middle of the train to its end, and half the part that grows with its square.
         covariance: of the change (m²).
@@ -156,7 +157,9 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
         return Agreement(log, change, covariance)
     weights = [np.ones(k.size) for (k, _, _), _ in spectra]
     for round_ in range(_ROUNDS):
-        information, right, log = np.diag([_CHANGE**-2] * 2), -change / _CHANGE**2, 0.0
+        information, right = np.diag([_CHANGE**-2] * 2), -change / _CHANGE**2
+        # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
+        log = -0.5 * _PULSE.size * sum(float(np.log(2 * n)) for (_, _, n), _ in spectra)
         for c, ((k, seen, independent), at) in enumerate(spectra):
             along = 2 * (at - at[0]) / (at[-1] - at[0]) - 1
             bend = np.stack([along, 0.5 * along**2])
