@@ -5,7 +5,9 @@ import pytest
 
 from solver import InputError
 from trackvib_ros.detection import Calibration, Channel, DetectorConfig, TrainDetector
-from trackvib_ros.detection.calibration import Measured
+from trackvib_ros.detection.blind import Blind, at_site
+from trackvib_ros.detection.calibration import POSITION_SIGMA, Measured
+from trackvib_ros.detection.kinematics import Motion
 
 from .synthetic import CATALOGUE, RAILS, Passage, blocks, record
 
@@ -101,3 +103,26 @@ def test_a_wrong_position_is_learned_and_then_allowed_for():
 def test_a_calibration_of_other_channels_is_refused():
     with pytest.raises(InputError, match="calibration is of channels a, b"):
         TrainDetector(RAILS, calibration=Calibration.untaught(NAMES, 0.02))
+
+
+def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
+    # 40 ± 0.1 m/s by 20 m between the channels, the distance said to be right to 0.5 m at either end
+    motion = Motion(0.0, 0.0, 40.0, 0.2, np.diag([1e-4, 0.1**2, 1e-4]))
+    seen = np.linspace(0.0, 1.0, 9)
+    blind = Blind(NAMES, 0.0, motion, (40.0, 0.1), seen, 0 * seen, 0.9, 1, 0.9, True, "delay",
+                  baseline=20.0)  # fmt: skip
+    told = at_site(blind, Calibration.untaught(NAMES, 0.5))
+    relative = (2 * 0.5**2 - 2 * POSITION_SIGMA**2) ** 0.5 / 20.0
+    assert told.speed == pytest.approx((40.0, np.hypot(0.1, 40.0 * relative)), rel=1e-12)
+    assert told.motion.speed_sigma(0.0) == pytest.approx(told.speed[1], rel=1e-12)
+    assert at_site(blind, Calibration.untaught(NAMES, POSITION_SIGMA)).speed == blind.speed
+    # a metre more, as five passages have taught, makes everything longer and faster
+    state = Calibration.untaught(NAMES, 0.5)
+    for _ in range(5):
+        state = state.learned(measured(1.0))
+    offset, covariance = state.relative(NAMES)
+    told = at_site(blind, state)
+    factor = 1 + offset[1] / 20.0
+    assert told.speed[0] == pytest.approx(40.0 * factor, rel=1e-12)
+    assert told.spacings == pytest.approx(factor * blind.spacings, rel=1e-12)
+    assert covariance[1, 1] ** 0.5 / 20.0 < relative / 10

@@ -38,7 +38,7 @@ def detect(
         samples: shape (samples,) or (samples, channels); NaN where missing.
         channels: one per column.
         catalogue: train types; the shipped one by default. ``Catalogue.from_axles`` makes one.
-        config: settings.
+        config: settings; :attr:`DetectorConfig.position_sigma` if positions are not by tape.
 
     Raises:
         InputError: shapes disagree, numbers are none, or the times go back.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from . import travel
+from .calibration import POSITION_SIGMA, Calibration
 from .kinematics import Motion
 from .pattern import Trace
 from .place import Wave, likelihood, locate
@@ -63,6 +64,7 @@ class Blind:
         spacing_sigma: of the distance between successive wheelsets (m), the speed apart.
         sensors: channels used, the reference first.
         x: position of the reference (m).
+        baseline: stated distance of the second channel from the reference (m).
     """
 
     sensors: tuple[str, ...]
@@ -78,6 +80,7 @@ class Blind:
     method: str
     axle_method: str = "energy peak"
     spacing_sigma: float = 0.3
+    baseline: float = np.inf
 
     @property
     def spacings(self) -> Array:
@@ -180,6 +183,32 @@ def describe(
     return _one_channel(traces[0], interval, limits, guess)
 
 
+def at_site(blind: Blind, site: Calibration) -> Blind:
+    """With what is known of the distance between the two channels, learned or doubted.
+
+    A centimetre of the tape is in the speed already.
+    """
+    if len(blind.sensors) < 2:
+        return blind
+    offset, covariance = site.relative(blind.sensors)
+    doubt = max(float(covariance[1, 1]) - 2 * POSITION_SIGMA**2, 0.0) ** 0.5
+    factor, relative = 1 + float(offset[1]) / blind.baseline, doubt / blind.baseline
+    motion, (speed, sigma) = blind.motion, blind.speed
+    scaled = factor**2 * motion.covariance
+    scaled[1, 1] += (relative * motion.speed) ** 2
+    return replace(
+        blind,
+        motion=Motion(
+            motion.epoch,
+            factor * motion.distance,
+            factor * motion.speed,
+            factor * motion.acceleration,
+            scaled,
+        ),
+        speed=(factor * speed, float(np.hypot(factor * sigma, relative * speed))),
+    )
+
+
 def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
     """With the doubt that wheelsets before the first or after the last one were missed."""
     sigma = blind.time_sigma.copy()
@@ -261,6 +290,7 @@ def _two_channels(
         method="delay between two rail channels",
         axle_method="pulses common to two rail channels",
         spacing_sigma=float(2**0.5 * np.median(wheelsets.sigma)),
+        baseline=b.channel.x - a.channel.x,
     )
 
 

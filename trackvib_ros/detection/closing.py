@@ -86,8 +86,9 @@ class Closing:
         found = self.search(records, within) if ended.found is None else ended.found
         if ended.begun is not None:
             rails, start_ns = ended.begun
-            if not _whole(found, (start_ns - ended.origin_ns) * 1e-9):
-                part = self._truncated(rails, start_ns, ended.last_ns)
+            begin = (start_ns - ended.origin_ns) * 1e-9
+            if not (_whole(found, begin) and found[0].known):
+                part = self._truncated(rails, start_ns, ended.last_ns, _whole(found, begin))
                 if part is not None:
                     return part
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
@@ -111,14 +112,21 @@ class Closing:
         return HeadMatcher(self._catalogue.types, self._limits, mirrored=True)
 
     def _truncated(
-        self, rails: list[Record], start_ns: int, last_ns: int
+        self, rails: list[Record], start_ns: int, last_ns: int, whole: bool
     ) -> list[TrainEvent] | None:
-        """Events of a train whose beginning is not on record; ``None`` if that is not so."""
+        """Events of a train whose beginning is not on record; ``None`` if that is not so.
+
+        Args:
+            rails: records of the rail channels.
+            start_ns: begin of the record.
+            last_ns: end of the event.
+            whole: whether the pattern of a train that is on record as a whole was found.
+        """
         within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
         found, quiet = departed(rails, within, self._limits, self._mirrored)
         if found is not None:
             return report.truncated(self._catalogue, found, start_ns)
-        if quiet > _AT_ONCE_S:
+        if quiet > _AT_ONCE_S or whole:
             return None
         return report.unclear(rails, last_ns, ("truncated_start",))
 
@@ -172,6 +180,6 @@ class Closing:
 
 def _whole(found: Sequence[Passage], start: float) -> bool:
     """Whether the first of the trains is on record, from ``start`` (s), with its first wheelset."""
-    if not found or not found[0].known:
+    if not found or not found[0].confirmed or not found[0].hypotheses:
         return False
     return float(found[0].hypotheses[0].fit.motion.time_at(-_AHEAD)) > start

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axles import AxleFit, fit_axles, refit
-from .blind import Blind, describe
+from .blind import Blind, at_site, describe
 from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
 from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN, Candidate, Explanation, explain
 from .health import clipped
 from .kinematics import Motion, robust_scale
-from .pattern import Match, Trace, independent, refine, scan, stretched
+from .pattern import FASTEST, SLOWEST, Match, Trace, independent, refine, scan, stretched
 from .place import Wave
 from .record import Record
 
@@ -55,6 +55,10 @@ _CERTAIN = 0.99
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
 
 _UNSTATED = 0.5  # m, distance between channels of no use
+
+_STRONG, _CORE = 1 / 16, 1 / 4  # of the strong energy, 12 and 6 dB below
+# what the rail carries beyond a train may last as long, and clipping makes it strong
+_MOST_CARRIED = 1.6
 
 _LOW_BAND_BONUS = 0.06  # of score, by which a higher band must win
 _STRETCH = (
@@ -145,7 +149,8 @@ class Passage:
     @property
     def confirmed(self) -> bool:
         """Whether this is a train: by its pattern, or by what two channels agree on."""
-        if self._patterned(CONFIRM_SCORE):
+        # a pattern that no type explains, at channels that contradict each other, is chance
+        if self._patterned(CONFIRM_SCORE) and (self.known or not self.clock_offset):
             return True
         return self.blind is not None and self.blind.travels
 
@@ -155,7 +160,9 @@ def smoothed(trace: Trace, width_s: float) -> Array:
     return trace.mean(trace.time - width_s / 2, trace.time + width_s / 2)
 
 
-def strong(trace: Trace, bandwidth: float, within: tuple[float, float]) -> NDArray[np.bool_]:
+def strong(
+    trace: Trace, bandwidth: float, within: tuple[float, float], below: float = _STRONG
+) -> NDArray[np.bool_]:
     """Bins whose 40 ms energy stands out of the noise and within 12 dB of the strong ones."""
     energy = smoothed(trace, 0.04)
     inside = (trace.time >= within[0]) & (trace.time <= within[1])
@@ -163,15 +170,15 @@ def strong(trace: Trace, bandwidth: float, within: tuple[float, float]) -> NDArr
         return inside
     top = float(np.percentile(energy[inside], 95))
     freedom = max(2 * bandwidth * 0.04, 2.0)
-    limit = max(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top / 16)
+    limit = max(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top * below)
     return np.asarray(inside & (energy > limit))
 
 
 def strong_interval(
-    trace: Trace, bandwidth: float, within: tuple[float, float]
+    trace: Trace, bandwidth: float, within: tuple[float, float], below: float = _STRONG
 ) -> tuple[float, float] | None:
     """First and last strong energy (s)."""
-    found = np.flatnonzero(strong(trace, bandwidth, within))
+    found = np.flatnonzero(strong(trace, bandwidth, within, below))
     if found.size < 2:
         return None
     return float(trace.time[found[0]]), float(trace.time[found[-1]])
@@ -195,6 +202,7 @@ class _Scanned:
     wave: Wave
     band: tuple[float, float]
     interval: tuple[float, float]
+    stretch: tuple[float, float]
     matches: list[Match]
 
     @property
@@ -207,6 +215,7 @@ def _scan_channel(
     within: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
+    alone: bool,
 ) -> _Scanned | None:
     found = []
     whole = record.traces(within)
@@ -219,8 +228,20 @@ def _scan_channel(
         interval = strong_interval(trace, band[1] - band[0], within)
         if interval is None:
             continue
+        core = strong_interval(trace, band[1] - band[0], within, _CORE) or interval
+        carried = min((interval[1] - interval[0]) / max(core[1] - core[0], 1e-3), _MOST_CARRIED)
+        # one channel that is not clipped had better not try what it need not
+        stretch = SLOWEST, FASTEST * (1.0 if alone and not wave.clipped else carried)
         ways = [
-            _Scanned(t, whole[0], wave, band, interval, scan([(t, 0.0)], interval, trains, limits))
+            _Scanned(
+                t,
+                whole[0],
+                wave,
+                band,
+                interval,
+                stretch,
+                scan([(t, 0.0)], interval, trains, limits, stretch),
+            )
             for t in (trace, limited)
         ]
         found.append(max(ways, key=lambda s: s.score))
@@ -257,10 +278,11 @@ def _in_step(
     duration = max(s.interval[1] - s.interval[0] for s in usable)
     middle = float(np.mean([sum(s.interval) / 2 for s in usable]))
     interval = (middle - duration / 2, middle + duration / 2)
+    stretch = SLOWEST, max(s.stretch[1] for s in usable)
     best: tuple[int, list[Match]] | None = None
     for direction in (1, -1):
         placed = [(s.trace, direction * x) for s, x in zip(usable, apart, strict=True)]
-        matches = scan(placed, interval, trains, limits)
+        matches = scan(placed, interval, trains, limits, stretch)
         if matches and (best is None or matches[0].score > best[1][0].score):
             best = direction, matches
     if best is None or best[1][0].score < HOPELESS_SCORE:
@@ -337,7 +359,7 @@ def find_passage(
     scanned = [
         found
         for record in records
-        if (found := _scan_channel(record, within, trains, limits)) is not None
+        if (found := _scan_channel(record, within, trains, limits, len(records) == 1)) is not None
     ]
     if not scanned:
         return None
@@ -361,6 +383,7 @@ def find_passage(
         guess = float(best.fit.motion.speed_at(best.mid_time))
     shown = [s.trace for s in scanned]
     blind = describe(records, shown, within, scanned[0].interval, limits, guess)
+    blind = blind and at_site(blind, site)
     if blind is not None and blind.travels and off:
         # an unlisted train is likelier than a pattern at either channel and a wrong clock
         return replace(

@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 DYNAMIC_RANGE = 300.0
 """Energy range below the strong axles that counts (25 dB)."""
 
+SLOWEST, FASTEST = 0.80, 1.25
+"""Speeds tried, as fractions of a train's span over the duration of its strong energy."""
+
 _TYPICAL = 0.85  # quantile: a third of a train is within 1 m of a wheelset, half of that is above
 _COARSE = 1.8  # m, smoothing of the first pass
 _COARSE_BEND = 2.0  # m
@@ -283,7 +286,7 @@ def scan(
     interval: tuple[float, float],
     trains: Sequence[TrainType],
     limits: tuple[float, float],
-    stretch: tuple[float, float] = (0.80, 1.25),
+    stretch: tuple[float, float] = (SLOWEST, FASTEST),
 ) -> list[Match]:
     """Coarse best matches of the types, at most one per type and orientation, best first.
 
