@@ -35,7 +35,7 @@ def test_the_first_train_does_not_wait_for_the_second(monkeypatch):
     """At 100 km/h a gap of 1.2 s leaves 0.5 s in which both rails, 20 m apart, are quiet."""
     searches = []
     search = Closing.search
-    monkeypatch.setattr(Closing, "search", lambda *a: searches.append(1) or search(*a))
+    monkeypatch.setattr(Closing, "search", lambda *a, **k: searches.append(1) or search(*a, **k))
     first, second, samples = pair(1.2)
     events = told(samples, 40)
     (at, one), (_, other) = [item for item in events if item[1].kind == "passage"]

@@ -76,9 +76,14 @@ class Closing:
         self._catalogue = catalogue
         self._limits = limits
 
-    def search(self, records: Sequence[Record], within: tuple[float, float]) -> list[Passage]:
-        """Every train that the rail channels show in an interval (s)."""
-        return find_passages(records, within, self._catalogue, self._limits, self.calibration)
+    def search(
+        self, records: Sequence[Record], within: tuple[float, float], unlisted: bool = True
+    ) -> list[Passage]:
+        """Every train that the rail channels show in an interval (s), quicker without those that no
+        type explains."""
+        return find_passages(
+            records, within, self._catalogue, self._limits, self.calibration, unlisted
+        )
 
     def conclude(self, ended: Ended) -> list[TrainEvent]:
         """The events at the end of an event; what its trains teach is kept."""

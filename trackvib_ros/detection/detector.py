@@ -432,8 +432,8 @@ class TrainDetector:
         last_ns = max(start for start, _ in quiet.values())
         within = (event.start_ns - origin) * 1e-9 - 0.5, (last_ns - origin) * 1e-9 + 0.3
         rails = [r for r in self._records(event, origin, now_ns, ends) if r.channel.layer == "rail"]
-        found = self._closing.search(rails, within)
-        if not found or not all(p.known and p.confirmed for p in found):
+        found = self._closing.search(rails, within, unlisted=False)
+        if not found or not all(p.known and p.confirmed and not p.clock_offset for p in found):
             return None
         train, best = found[-1], found[-1].hypotheses[0]
         if train.direction == 0 or not (

@@ -623,16 +623,20 @@ def find_passages(
     catalogue: Catalogue,
     limits: tuple[float, float],
     site: Calibration | None = None,
+    unlisted: bool = True,
 ) -> list[Passage]:
-    """Every train in an event, in order of time: at the longest pauses, two are tried for one."""
+    """Every train in an event, in order of time: at the longest pauses, two are tried for one.
+
+    Without ``unlisted`` none that no type explains, quicker.
+    """
     site = site or Calibration.untaught([r.channel.name for r in records])
     rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
     if not rails:
         return []
-    whole = find_passage(rails, within, catalogue.types, limits, site)
+    whole = find_passage(rails, within, catalogue.types, limits, site, unlisted)
     if whole is None:
         return []
-    return _divided(rails, within, whole, catalogue, limits, site, depth=3)
+    return _divided(rails, within, whole, catalogue, limits, site, unlisted, depth=3)
 
 
 def apart(first: Passage, second: Passage) -> float:
@@ -652,31 +656,34 @@ def _divided(
     catalogue: Catalogue,
     limits: tuple[float, float],
     site: Calibration,
+    unlisted: bool,
     depth: int,
 ) -> list[Passage]:
-    trace = whole.traces[0]
+    trace, types = whole.traces[0], catalogue.types
     gaps = quiet_gaps(trace, whole.band[1] - whole.band[0], within, 0.6)
     if whole.score > 0.8 or depth == 0:
         return [whole]
     # a part in which something travels gives the whole most of its delay
-    unlisted = whole.known or (whole.blind is not None and whole.blind.direction != 0)
+    travels = whole.known or (whole.blind is not None and whole.blind.direction != 0)
     for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
         parts: list[Passage] = []
         for half in halves:
-            part = find_passage(rails, half, catalogue.types, limits, site, unlisted)
+            part = find_passage(rails, half, types, limits, site, unlisted and travels)
             if part is None or not part.confirmed:
                 break
             parts.append(part)
         better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1
         if better and apart(parts[0], parts[1]) > catalogue.longest_gap:
-            if not unlisted and not all(part.known for part in parts):
-                tried = [find_passage(rails, h, catalogue.types, limits, site) for h in halves]
+            if unlisted and not travels and not all(part.known for part in parts):
+                tried = [find_passage(rails, half, types, limits, site) for half in halves]
                 parts = [part for part in tried if part is not None]
             return [
                 found
                 for half, part in zip(halves, parts, strict=True)
-                for found in _divided(rails, half, part, catalogue, limits, site, depth - 1)
+                for found in _divided(
+                    rails, half, part, catalogue, limits, site, unlisted, depth - 1
+                )
             ]
     return [whole]
