@@ -6,6 +6,7 @@ import pytest
 from solver import InputError
 from trackvib_ros.detection import Calibration, Channel, DetectorConfig, TrainDetector
 from trackvib_ros.detection.blind import Blind, at_site
+from trackvib_ros.detection.bowl import SHAPE_SIGMA
 from trackvib_ros.detection.calibration import POSITION_SIGMA, Measured
 from trackvib_ros.detection.kinematics import Motion
 
@@ -126,3 +127,54 @@ def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
     assert told.speed[0] == pytest.approx(40.0 * factor, rel=1e-12)
     assert told.spacings == pytest.approx(factor * blind.spacings, rel=1e-12)
     assert covariance[1, 1] ** 0.5 / 20.0 < relative / 10
+
+
+def test_bowl_is_learned_as_a_weighted_mean():
+    start = Calibration.untaught(NAMES)
+    before, spread = start.wavenumber("a")
+    found = start.learned_bowl("a", 2.0, 0.03)
+    noise = 0.03**2 + SHAPE_SIGMA**2
+    value, sigma = found.wavenumber("a")
+    weight = spread**2 / (spread**2 + noise)
+    assert np.log(value / before) == pytest.approx(weight * np.log(2.0 / before), rel=1e-12)
+    assert sigma == pytest.approx((1 / spread**2 + 1 / noise) ** -0.5, rel=1e-12)
+    assert found.wavenumber("b") == (before, spread)
+    assert found.learned_bowl("a", 4.0, 0.03) is found
+
+
+def test_file_and_back(tmp_path):
+    path = tmp_path / "site.json"
+    state = Calibration.untaught(NAMES).learned(measured(0.02)).learned_bowl("b", 1.6, 0.02)
+    state.save(path)
+    state.save(path)
+    assert Calibration.load(path).to_json() == state.to_json()
+    assert [p.name for p in tmp_path.iterdir()] == ["site.json"]
+
+
+@pytest.mark.parametrize("text", ["", "notes", "{}", '{"schema": "other"}', "\xff"])
+def test_what_is_no_calibration_is_not_overwritten(tmp_path, text):
+    path = tmp_path / "notes.txt"
+    path.write_text(text, "latin-1")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        Calibration.untaught(NAMES).save(path)
+    assert path.read_text("latin-1") == text
+
+
+def test_a_directory_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        Calibration.untaught(NAMES).save(tmp_path / "nowhere" / "site.json")
+
+
+def test_known_trains_teach_the_bowl_and_so_the_speed_of_an_unlisted_one():
+    detector = TrainDetector(RAILS[:1])
+    start_ns = 0
+    for seed, speed in enumerate((40.0, 60.0)):
+        part = record([Passage(CATALOGUE["ICE1"].axles, speed)], RAILS[:1], 30, seed, kind="pulse")
+        for block in blocks(part, 0.5, start_ns):
+            detector.process(block)
+        detector.finish()
+        start_ns += 60 * 10**9
+    # the pulses of the stand-in are those of a beam with k/4EI = 1 m^-4: k0 = sqrt 2
+    value, sigma = detector.calibration.wavenumber(RAILS[0].name)
+    assert value == pytest.approx(2**0.5, rel=0.06)
+    assert sigma < 0.04

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from . import travel
+from .bowl import WAVENUMBER, WAVENUMBER_SPREAD
 from .calibration import POSITION_SIGMA, Calibration
 from .kinematics import Motion
 from .pattern import Trace
 from .place import Wave, likelihood, locate
 from .record import Record
+from .single import HUMP, HUMP_FINE, alone, log_energy
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -23,25 +25,17 @@ Array = NDArray[np.float64]
 CONFIDENT = 0.8
 """Least probability of a number of wheelsets that is told without reserve."""
 
-TYPICAL_WHEELBASE = 2.6
-"""Middle of the wheelbases of catalogue bogies (2.2 to 3.0 m)."""
-
-WHEELBASE_SPREAD = 0.10
-"""Relative standard deviation of a wheelbase about the typical one."""
-
 _GRID_S = 0.002
-_PEAK_WIDTH = 0.7  # m
-_LEAST_DISTANCE = 1.5  # m between wheelsets
-_PROMINENCE = 0.7  # ln of energy, 3 dB
 
 _PULSE_CELLS = 60  # of :data:`travel.CELL`
 _BEAM = 1.2  # 1/m, sqrt^4(k/4EI) of a rail on fastenings of 40 to 100 kN/mm every 0.65 m
-_HUMP, _HUMP_FINE = 0.5, 0.2  # m, of the log-energy at a wheelset, and its smoothing
 _EXPLAINED = 0.9  # of a signal's variance, at which no other is needed
 _BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other
 _PARTNER = 3.6  # m, the other wheelset of a bogie, or of the next one
 _PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bogies are seen
 _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
+_LEAST_WORTH = 25.0  # e^25 outweighs the speeds and pulses tried, as for two channels
+_LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right than wrong
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
 
@@ -58,10 +52,12 @@ class Blind:
             :data:`CONFIDENT` the count is not to be trusted.
         direction: +1, -1, or 0 unknown.
         correlation: of the energies of two channels; 0 with one channel.
-        travels: whether two channels show the same wheelsets one after the other.
+        travels: whether this is a train: two channels show the same wheelsets one after the other,
+            or one shows bogies of one wheelbase.
         method: how the speed was obtained.
         axle_method: how the wheelsets were.
         spacing_sigma: of the distance between successive wheelsets (m), the speed apart.
+        interval: of 95 % of the speed at mid-train (m/s), if it is not symmetric.
         sensors: channels used, the reference first.
         x: position of the reference (m).
         baseline: stated distance of the second channel from the reference (m).
@@ -81,43 +77,12 @@ class Blind:
     axle_method: str = "energy peak"
     spacing_sigma: float = 0.3
     baseline: float = np.inf
+    interval: tuple[float, float] | None = None
 
     @property
     def spacings(self) -> Array:
         """Distances between successive wheelsets (m)."""
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
-
-
-def peaks(trace: Trace, speed: float, interval: tuple[float, float]) -> Array:
-    """Times (s) of the energy peaks that could be wheelsets at about this speed."""
-    step = min(trace.step, 0.1 / speed)
-    time = np.arange(interval[0] - 2.0 / speed, interval[1] + 2.0 / speed, step)
-    half = _PEAK_WIDTH / 2 / speed
-    level = trace.level(time - half, time + half)
-    top = float(np.percentile(level, 95))
-    found, _ = signal.find_peaks(
-        level,
-        prominence=_PROMINENCE,
-        height=max(0.35 * top, 1.0),
-        distance=max(1, int(_LEAST_DISTANCE / speed / step)),
-    )
-    return np.asarray(time[found])
-
-
-def regularity(times: Array, speed: float) -> float:
-    """Share of the peaks that pair into bogies of one wheelbase (2 to 3.3 m)."""
-    if times.size < 4:
-        return 0.0
-    gaps = np.diff(times) * speed
-    short = gaps[(gaps > 1.8) & (gaps < 3.6)]
-    if short.size < 2:
-        return 0.0
-    base = float(np.median(short))
-    near = np.abs(gaps - base) < 0.15 * base
-    paired = np.zeros(times.size, dtype=bool)
-    paired[:-1] |= near
-    paired[1:] |= near
-    return float(paired.mean())
 
 
 def envelope_delay(
@@ -159,28 +124,23 @@ def envelope_delay(
 
 def describe(
     records: Sequence[Record],
-    traces: Sequence[Trace],
     within: tuple[float, float],
     interval: tuple[float, float],
     limits: tuple[float, float],
-    guess: float | None = None,
 ) -> Blind | None:
-    """What one or two rail channels tell of a train that no catalogue type explains.
+    """What two rail channels tell of a train that no catalogue type explains.
 
     Args:
-        records: rail channels.
-        traces: of the same in the band that serves the pattern; the first is the reference.
+        records: rail channels, two or more.
         within: the event (s).
         interval: first and last strong energy (s).
         limits: speeds (m/s).
-        guess: speed of the nearest catalogue type (m/s), for one channel.
     """
     ordered = sorted(records, key=lambda r: r.channel.x)
-    if len(ordered) > 1:
-        blind = _two_channels(ordered[0], ordered[-1], within, limits)
-        if blind is not None:
-            return blind if blind.regular >= CONFIDENT else _wary(blind, interval)
-    return _one_channel(traces[0], interval, limits, guess)
+    blind = _two_channels(ordered[0], ordered[-1], within, limits)
+    if blind is None or blind.regular >= CONFIDENT:
+        return blind
+    return _wary(blind, interval)
 
 
 def at_site(blind: Blind, site: Calibration) -> Blind:
@@ -229,18 +189,14 @@ def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
         travel.band_pass(x, travel.FINE, travel.BROAD) for x in (*waves, bending)
     )
     out = [(first, second, pulse)]
-    hump = travel.band_pass(np.exp(-0.5 * (lag / _HUMP) ** 2), _HUMP_FINE, travel.BROAD)
+    hump = travel.band_pass(np.exp(-0.5 * (lag / HUMP) ** 2), HUMP_FINE, travel.BROAD)
     for two in zip(*pair.traces, strict=True):
         first, second = (
-            travel.band_pass(_log_energy(t, e), _HUMP_FINE, travel.BROAD)
+            travel.band_pass(log_energy(t, e), HUMP_FINE, travel.BROAD)
             for t, e in zip(two, edges, strict=True)
         )
         out.append((first, second, hump))
     return out
-
-
-def _log_energy(trace: Trace, edges: Array) -> Array:
-    return np.log(np.maximum(trace.mean(edges[:-1], edges[1:]), trace.noise))
 
 
 def _two_channels(
@@ -332,44 +288,52 @@ def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:
     return bogies >= _LEAST_BOGIES and bool(many)
 
 
-def _one_channel(
-    trace: Trace, interval: tuple[float, float], limits: tuple[float, float], guess: float | None
+def describe_alone(
+    record: Record,
+    within: tuple[float, float],
+    interval: tuple[float, float],
+    limits: tuple[float, float],
+    guess: float | None,
+    band: int,
+    bowl: tuple[float, float] = (WAVENUMBER, WAVENUMBER_SPREAD),
 ) -> Blind | None:
-    """Speed from the wheelbase, whose typical value is known to ten percent."""
-    best: tuple[float, float, Array] | None = None
-    trials = (
-        np.geomspace(limits[0], limits[1], 24) if guess is None else guess * np.array([0.9, 1, 1.1])
-    )
-    for trial in trials:
-        times = peaks(trace, float(trial), interval)
-        score = regularity(times, float(trial))
-        if times.size >= 4 and (best is None or score > best[0]):
-            best = (score, float(trial), times)
-    if best is None:
+    """What one rail channel tells of a train that no catalogue type explains.
+
+    Args:
+        record: rail channel.
+        within: the event (s).
+        interval: first and last strong energy (s).
+        limits: speeds (m/s).
+        guess: speed of the nearest catalogue type (m/s).
+        band: whose energies show most.
+        bowl: wavenumber of the rail's deflection (rad/m), relative standard deviation.
+    """
+    found = alone(record, within, interval, limits, guess, band, bowl)
+    if found is None:
         return None
-    score, trial, times = best
-    gaps = np.diff(times)
-    short = gaps[(gaps * trial > 1.8) & (gaps * trial < 3.6)]
-    if short.size < 2:
-        return None
-    speed = TYPICAL_WHEELBASE / float(np.median(short))
-    sigma = WHEELBASE_SPREAD * speed
-    method = "typical wheelbase"
-    if guess is not None and abs(guess / speed - 1) < 2 * WHEELBASE_SPREAD:
-        speed, sigma, method = guess, 0.06 * guess, "nearest catalogue type"
-    epoch = float(times[0])
-    covariance = np.diag([0.3**2, sigma**2, 0.6**2])
-    motion = Motion(epoch, 0.0, speed, 0.0, covariance)
-    return Blind(
-        sensors=(trace.name,),
-        x=trace.x,
-        motion=motion,
+    speed, sigma, span = found.speed
+    places = found.motion.distance_at(found.times)
+    gaps = np.diff(places)
+    paired = np.append(gaps < _PARTNER, False) | np.append(False, gaps < _PARTNER)
+    deflected = found.corner is not None
+    whole = deflected and paired.mean() > _PAIRED
+    blind = Blind(
+        sensors=(record.channel.name,),
+        x=record.channel.x,
+        motion=found.motion,
         speed=(speed, sigma),
-        times=times,
-        time_sigma=np.full(times.size, 0.4 / speed),
-        regular=score,
+        times=found.times,
+        time_sigma=found.time_sigma,
+        regular=found.certainty if whole else min(found.certainty, 0.5),
         direction=0,
         correlation=0.0,
-        travels=False,
-        method=method,
+        travels=found.corner is not None
+        and found.corner.worth(2) > _LEAST_WORTH
+        and found.certainty > _LIKELY
+        and found.paired > _PAIRED
+        and found.times.size >= 2 * _LEAST_WHEELSETS,
+        method=found.method,
+        axle_method="deflection of the rail" if deflected else "energy peak",
+        interval=span,
     )
+    return blind if blind.regular >= CONFIDENT else _wary(blind, interval)

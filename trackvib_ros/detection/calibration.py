@@ -1,4 +1,5 @@
-"""What passages teach about a site: where the rail channels are against each other.
+"""What passages teach about a site: where the rail channels are against each other, and how long
+the bowl is that a wheel presses into the rail.
 
 The effective place of channel c is x_c + delta_c, delta a priori independent and N(0, sigma²). A
 passage whose wheelset pattern tells the type without the distance between the channels measures
@@ -9,8 +10,10 @@ Models, Estimation and Control, 1979, ch. 5).
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +21,15 @@ from numpy.typing import NDArray
 
 from solver import InputError
 
+from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD
+
 Array = NDArray[np.float64]
 
 POSITION_SIGMA = 0.02
 """Standard uncertainty (m) of the stated position of a channel: measured along the rail by tape."""
+
+SCHEMA = "trackvib-calibration-2"
+"""Name and version of the text that :meth:`Calibration.to_json` writes."""
 
 _MEMORY = 300.0  # passages after which what was learned has faded to what was stated
 _GATE = 4.0  # standard deviations: more is another train than was thought, or a moved sensor
@@ -47,19 +55,54 @@ class Calibration:
         covariance: of the offsets (m²), shape (channels, channels).
         stated: standard uncertainty of the stated positions (m).
         passages: that were learned from.
+        bowl: ln of the wavenumber k0 (rad/m) of the rail's deflection at every channel
+            (:mod:`bowl`), shape (channels,).
+        bowl_variance: of it, shape (channels,).
     """
 
     channels: tuple[str, ...]
     offset: Array
     covariance: Array
     stated: float
-    passages: int = 0
+    passages: int
+    bowl: Array
+    bowl_variance: Array
 
     @classmethod
     def untaught(cls, channels: Sequence[str], stated: float = POSITION_SIGMA) -> Calibration:
         """The positions as stated, with a standard uncertainty (m)."""
         n = len(channels)
-        return cls(tuple(channels), np.zeros(n), stated**2 * np.eye(n), stated)
+        return cls(
+            channels=tuple(channels),
+            offset=np.zeros(n),
+            covariance=stated**2 * np.eye(n),
+            stated=stated,
+            passages=0,
+            bowl=np.full(n, np.log(WAVENUMBER)),
+            bowl_variance=np.full(n, WAVENUMBER_SPREAD**2),
+        )
+
+    def wavenumber(self, name: str) -> tuple[float, float]:
+        """Wavenumber of the deflection at a channel (rad/m), and its relative sigma."""
+        k = self.channels.index(name)
+        return float(np.exp(self.bowl[k])), float(self.bowl_variance[k] ** 0.5)
+
+    def learned_bowl(self, name: str, wavenumber: float, sigma: float) -> Calibration:
+        """What a train of known speed adds, by the wavenumber (rad/m, relative sigma) it shows.
+
+        Nothing if that contradicts by more than four standard deviations.
+        """
+        k = self.channels.index(name)
+        prior = float(self.bowl_variance[k]) + 2 * WAVENUMBER_SPREAD**2 / _MEMORY
+        prior = min(prior, WAVENUMBER_SPREAD**2)
+        noise = sigma**2 + SHAPE_SIGMA**2
+        surprise = float(np.log(wavenumber) - self.bowl[k])
+        if abs(surprise) > _GATE * np.sqrt(prior + noise):
+            return self
+        bowl, variance = self.bowl.copy(), self.bowl_variance.copy()
+        bowl[k] += surprise * prior / (prior + noise)
+        variance[k] = prior * noise / (prior + noise)
+        return replace(self, bowl=bowl, bowl_variance=variance)
 
     def relative(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Offsets of channels from that of the first of them (m), and their covariance (m²)."""
@@ -76,12 +119,11 @@ class Calibration:
             return self
         gain = prior @ rows.T @ np.linalg.inv(expected)
         covariance = prior - gain @ rows @ prior
-        return Calibration(
-            self.channels,
-            self.offset + gain @ surprise,
-            0.5 * (covariance + covariance.T),
-            self.stated,
-            self.passages + 1,
+        return replace(
+            self,
+            offset=self.offset + gain @ surprise,
+            covariance=0.5 * (covariance + covariance.T),
+            passages=self.passages + 1,
         )
 
     def _differences(self, names: Sequence[str]) -> Array:
@@ -92,15 +134,49 @@ class Calibration:
         rows[:, index[0]] -= 1.0
         return rows
 
+    def save(self, path: Path) -> None:
+        """Write a file that :meth:`load` reads, at once or not at all.
+
+        Raises:
+            InputError: something is there that is no calibration, or it cannot be written.
+        """
+        if path.exists():
+            Calibration.load(path)
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            part.write_text(self.to_json() + "\n", "utf-8")
+            part.replace(path)
+        except OSError as failure:
+            part.unlink(missing_ok=True)
+            raise InputError(f"calibration {path} cannot be written: {failure.strerror}") from None
+
+    @classmethod
+    def load(cls, path: Path) -> Calibration:
+        """The calibration in a file.
+
+        Raises:
+            InputError: it cannot be read, or is none.
+        """
+        try:
+            return cls.from_json(path.read_text("utf-8"))
+        except (OSError, UnicodeDecodeError) as failure:
+            reason = getattr(failure, "strerror", None) or "it is no text"
+            raise InputError(f"calibration {path} cannot be read: {reason}") from None
+        except InputError as failure:
+            raise InputError(f"{path} is not used or overwritten: {failure}") from None
+
     def to_json(self) -> str:
         """Text to keep it in; :meth:`from_json` reverses it."""
         return json.dumps(
             {
+                "schema": SCHEMA,
                 "channels": self.channels,
                 "offset_m": self.offset.tolist(),
                 "covariance_m2": self.covariance.tolist(),
                 "stated_m": self.stated,
                 "passages": self.passages,
+                "ln_bowl_wavenumber": self.bowl.tolist(),
+                "ln_bowl_variance": self.bowl_variance.tolist(),
             }
         )
 
@@ -109,13 +185,20 @@ class Calibration:
         """The calibration written by :meth:`to_json`.
 
         Raises:
-            InputError: a field is missing or of the wrong shape.
+            InputError: another schema, or a field is missing or of the wrong shape.
         """
         try:
             table: Mapping[str, Any] = json.loads(text)
+            schema = table["schema"]
+            if schema != SCHEMA:
+                raise InputError(
+                    f"calibration: schema is {schema!r}, this version reads {SCHEMA!r}"
+                )
             names = tuple(str(name) for name in table["channels"])
             offset = np.array(table["offset_m"], dtype=np.float64)
             covariance = np.array(table["covariance_m2"], dtype=np.float64)
+            bowl = np.array(table["ln_bowl_wavenumber"], dtype=np.float64)
+            variance = np.array(table["ln_bowl_variance"], dtype=np.float64)
             stated, passages = float(table["stated_m"]), int(table["passages"])
         except (ValueError, KeyError, TypeError) as failure:
             raise InputError(f"calibration: {failure}; give what to_json wrote") from None
@@ -125,6 +208,15 @@ class Calibration:
                 f"calibration: offset_m {offset.shape} and covariance_m2 {covariance.shape} must "
                 f"be ({n},) and ({n}, {n}), one per channel"
             )
-        if not (np.isfinite(offset).all() and np.linalg.eigvalsh(covariance).min() >= -1e-12):
+        if bowl.shape != (n,) or variance.shape != (n,):
+            raise InputError(
+                f"calibration: ln_bowl_wavenumber {bowl.shape} and ln_bowl_variance "
+                f"{variance.shape} must be ({n},), one per channel"
+            )
+        if not (np.isfinite(covariance).all() and np.isfinite(offset).all()) or (
+            n and np.linalg.eigvalsh(covariance).min() < -1e-12
+        ):
             raise InputError("calibration: covariance_m2 must be finite and not negative (m²)")
-        return cls(names, offset, covariance, stated, passages)
+        if not (np.isfinite(bowl).all() and np.isfinite(variance).all() and np.all(variance > 0)):
+            raise InputError("calibration: ln_bowl_variance must be finite and positive (-)")
+        return cls(names, offset, covariance, stated, passages, bowl, variance)

@@ -10,18 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import report
+from .bowl import SHAPE_SIGMA
 from .calibration import Calibration
 from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import departed
-from .passage import Passage, excited, find_passages
+from .passage import Passage, bowl_of, excited, find_passages
 from .record import Record
 from .response import find_response
 
 Array = NDArray[np.float64]
 
+_ENOUGH = 0.5  # of what trains differ by, at which one more teaches little
 _AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
 _AHEAD = 1.0  # m before a first wheelset that is on record
 
@@ -109,8 +111,25 @@ class Closing:
         for passage in found:
             if passage.confirmed and passage.known and passage.measured is not None and not swapped:
                 self.calibration = self.calibration.learned(passage.measured)
+            if passage.confirmed and passage.known and not swapped and not passage.clock_offset:
+                self._learn_bowls(records, passage)
         events = self._passage_health(ended.now_ns, records, within, found, swapped)
         return events + report.closing(self._catalogue, records, ended.origin_ns, within, found)
+
+    def _learn_bowls(self, records: Sequence[Record], passage: Passage) -> None:
+        """How long the deflection is, at the channels where that is not known well enough yet."""
+        names = {trace.name for trace in passage.traces}
+        best = passage.hypotheses[0]
+        speed = float(best.fit.motion.speed_at(best.mid_time))
+        for record in records:
+            name = record.channel.name
+            if name not in names or self.calibration.wavenumber(name)[1] < _ENOUGH * SHAPE_SIGMA:
+                continue
+            shown = bowl_of(record, passage)
+            if shown is not None:
+                self.calibration = self.calibration.learned_bowl(
+                    name, shown.value / speed, shown.sigma
+                )
 
     @cached_property
     def _mirrored(self) -> HeadMatcher:

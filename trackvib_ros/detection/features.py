@@ -30,6 +30,9 @@ Their filters have linear phase (Bessel low-pass; delayed signal minus its movin
 high-pass): the slow pulse of a wheel at 40 km/h keeps its symmetry and its place.
 """
 
+LOW_TOP = 100.0
+"""Edge (Hz) of the low-passed waveform, a Bessel filter of second order."""
+
 FRAME_S = 0.01
 """Length of a decision frame (s), nearly: a whole number of bins."""
 
@@ -176,7 +179,7 @@ class GroupStream:
                 for sos, fir in zip(self._sos, self._fir, strict=True)
             ]
         )
-        top = min(100.0, 0.4 * inner)
+        top = min(LOW_TOP, 0.4 * inner)
         low_sos = signal.bessel(2, top, "low", norm="mag", fs=inner, output="sos")
         self._sos.append(low_sos)
         self._fir.append(np.ones(1))

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axles import AxleFit, fit_axles, refit
-from .blind import Blind, at_site, describe
+from .blind import Blind, at_site, describe, describe_alone
+from .bowl import WAVENUMBER, Corner, corner
 from .calibration import Calibration, Measured
 from .catalogue import Catalogue, TrainType
 from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN, Candidate, Explanation, explain
@@ -53,6 +54,8 @@ _CERTAIN = 0.99
 """Probability of a type, by its pattern alone, that teaches where the channels are."""
 
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
+
+_AROUND_S = 0.5  # s, of an interval of strong energy that belongs to its train
 
 _UNSTATED = 0.5  # m, distance between channels of no use
 
@@ -377,12 +380,9 @@ def find_passage(
     off = bool(passage.clock_offset)
     if not unlisted or (passage.known and not (off and passage.score < CLOCK_SCORE)):
         return passage
-    guess = None
-    if passage.hypotheses:
-        best = passage.hypotheses[0]
-        guess = float(best.fit.motion.speed_at(best.mid_time))
-    shown = [s.trace for s in scanned]
-    blind = describe(records, shown, within, scanned[0].interval, limits, guess)
+    if len(records) < 2:
+        return passage
+    blind = describe(records, within, reference.interval, limits)
     blind = blind and at_site(blind, site)
     if blind is not None and blind.travels and off:
         # an unlisted train is likelier than a pattern at either channel and a wrong clock
@@ -636,7 +636,50 @@ def find_passages(
     whole = find_passage(rails, within, catalogue.types, limits, site, unlisted)
     if whole is None:
         return []
-    return _divided(rails, within, whole, catalogue, limits, site, unlisted, depth=3)
+    found = _divided(rails, within, whole, catalogue, limits, site, unlisted, depth=3)
+    if len(rails) > 1 or not unlisted:
+        return found
+    return [p if p.known else _described(rails[0], within, p, limits, site) for p in found]
+
+
+def bowl_of(record: Record, passage: Passage) -> Corner | None:
+    """The corner of the deflection that a train of a known type shows at a rail channel.
+
+    ``None`` if the type, or the deflection, is not beyond doubt.
+    """
+    best = passage.hypotheses[0]
+    window = record.window
+    wave = Wave(window.time - window.low_shift, window.low, window.valid)
+    if best.probability < _CERTAIN:
+        return None
+    apart = passage.direction * (record.channel.x - passage.traces[0].x)
+    if passage.direction == 0 and record.channel.name != passage.traces[0].name:
+        return None
+    motion = best.fit.motion
+    times = motion.time_at(best.places + apart)
+    found = corner(wave, times, WAVENUMBER * motion.speed)
+    found = found and corner(wave, found.times, found.value)
+    return found if found is not None and found.worth(2) > 0 else None
+
+
+def _described(
+    record: Record,
+    within: tuple[float, float],
+    passage: Passage,
+    limits: tuple[float, float],
+    site: Calibration,
+) -> Passage:
+    """What the only rail channel tells of a train that no type explains."""
+    guess = None
+    if passage.hypotheses:
+        best = passage.hypotheses[0]
+        guess = float(best.fit.motion.speed_at(best.mid_time))
+    start, end = passage.interval
+    alone = (max(within[0], start - _AROUND_S), min(within[1], end + _AROUND_S))
+    band = record.window.bands.index(passage.band)
+    bowl = site.wavenumber(record.channel.name)
+    blind = describe_alone(record, alone, passage.interval, limits, guess, band, bowl)
+    return replace(passage, blind=blind)
 
 
 def apart(first: Passage, second: Passage) -> float:

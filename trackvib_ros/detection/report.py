@@ -25,6 +25,7 @@ _UNITS = {1: "single", 2: "double"}
 _GEOMETRY = 0.03  # m, wheelsets of a train against its type
 _WHEELBASE = 0.1  # m, half of what wheelbases differ by: that of an unknown type is not measured
 _PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
+_SIZE = 0.14  # ln of car lengths from 17 to 27.5 m, equally likely: 0.48 / sqrt 12
 _MARGIN_S = 0.15  # of a record about the strong energy of a train that is wholly on it
 _MARGIN = 0.5  # m, the same about its wheelsets if these are known
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
@@ -221,6 +222,10 @@ def _speed(passage: Passage) -> tuple[float, float, float, tuple[float, float]]:
     speed = float(best.fit.motion.speed_at(when))
     if not passage.known:
         speed = sum(w * v for w, v, _ in relatives) / sum(w for w, _, _ in relatives)
+        if (
+            len(passage.traces) == 1
+        ):  # nothing fixes the size of what the listed types only resemble
+            parts = [(w, v, float(np.hypot(s, _SIZE * v))) for w, v, s in parts]
     total = sum(w for w, _, _ in parts)
     variance = sum(w * ((v - speed) ** 2 + s**2) for w, v, s in parts) / total
     half = max(half_interval(parts, speed), 1.96 * own)
@@ -548,6 +553,8 @@ def _unknown(
         "correlation": round(blind.correlation, 4),
         "catalogue": catalogue.version,
     }
+    if blind.interval is not None:
+        values["speed_interval"] = tuple(round(v, 6) for v in blind.interval)
     for kind, time in (("departure", times[-1]), ("passage", times[0])):
         events.append(
             TrainEvent(

@@ -228,12 +228,13 @@ def _own(rest: Array, r: Array, places: Array, q: Array) -> Array:
     return np.asarray(rest + np.where(lag[rows, near] < 0.5 * _LEAST / CELL, own, 0.0))
 
 
-def find(y: Array, noise: Array, pulse: Array) -> Wheelsets | None:
+def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
     """The wheelsets in a signal.
 
     Args:
         y: over distance, spacing :data:`CELL`, shape (cells,).
-        noise: what of it is known to be noise, the same shape: half the difference of two records.
+        noise: what of it is known to be noise, the same shape: half the difference of two records;
+            ``None`` where nothing is known but what the wheelsets leave.
         pulse: first guess, odd number of cells.
     """
     half = round(_HALF / CELL)
@@ -246,8 +247,14 @@ def find(y: Array, noise: Array, pulse: Array) -> Wheelsets | None:
     def overlap() -> Array:
         return np.asarray(np.correlate(pulse, pulse, "full")[pulse.size - 1 :])
 
-    least = float(np.std(filtered(noise)))
-    start, q = _pursued(filtered(y), overlap(), least)
+    def doubt(rest: Array) -> float:
+        return float(np.std(filtered(rest if noise is None else noise)))
+
+    output = filtered(y)
+    least = doubt(y)
+    if noise is None:
+        least = 1.4826 * float(np.median(np.abs(output)))
+    start, q = _pursued(output, overlap(), least)
     if start.size < 2:
         return None
     order = np.argsort(start)
@@ -258,7 +265,7 @@ def find(y: Array, noise: Array, pulse: Array) -> Wheelsets | None:
             pulse = _learnt(y, places, q, pulse)
             pulse = pulse / np.sqrt(float(pulse @ pulse))
             places, q, rest = _fitted(y, pulse, places)
-        deviation = float(np.hypot(np.std(filtered(noise)), _MISFIT * height))
+        deviation = float(np.hypot(doubt(rest), _MISFIT * height))
         c = _own(filtered(rest), overlap(), places, q)[::_STEP]
         chain = _Chain(c, height, deviation, _gap_prior(np.diff(places) * CELL))
         path = chain.best()

@@ -1,0 +1,69 @@
+"""One rail and a train that no catalogue lists: its wheelsets, and a speed with an honest sigma."""
+
+import numpy as np
+import pytest
+from scipy import fft
+
+from tests.detection.synthetic import RAILS, Passage, record
+from trackvib_ros.detection import CONFIRMED, Catalogue, detect
+from trackvib_ros.detection.bowl import corner, low_pass
+from trackvib_ros.detection.place import Wave
+
+STEP = 0.001
+CAR = np.array([0.0, 2.5, 17.5, 20.0])
+PLACES = (CAR + 25.0 * np.arange(6)[:, None]).ravel()
+
+
+def bowls(wavenumber: float, speed: float, noise: float, rng: np.random.Generator) -> Wave:
+    """A waveform made of the pulses of the module's equation, first wheelset at 1 s, and noise."""
+    time = STEP * np.arange(round((PLACES[-1] / speed + 2) / STEP))
+    f = fft.rfftfreq(time.size, STEP)
+    x = 2 * np.pi * f / (wavenumber * speed)
+    loads = rng.uniform(0.8, 1.2, PLACES.size)
+    late = np.exp(-2j * np.pi * np.outer(f, 1.0 + PLACES / speed)) @ loads
+    value = fft.irfft(np.sqrt(low_pass(f, STEP)) * x**2 / (1 + x**4) * late, time.size)
+    value /= np.abs(value).max()
+    value += noise * rng.standard_normal(time.size)
+    return Wave(time, value, np.ones(time.size, dtype=bool))
+
+
+@pytest.mark.parametrize(("wavenumber", "speed"), [(1.5, 30.0), (1.8, 60.0), (2.1, 90.0)])
+def test_corner_of_its_own_equation(wavenumber, speed):
+    wave = bowls(wavenumber, speed, 0.0, np.random.default_rng(0))
+    found = corner(wave, 1.0 + PLACES / speed, 1.1 * wavenumber * speed)
+    # the search ends at 4e-3 of ln, the prior about 1 Hz of coupling pulls a little more
+    assert found.value == pytest.approx(wavenumber * speed, rel=0.01)
+    assert found.explained > 0.995
+
+
+def test_sigma_of_the_corner_holds():
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(16):
+        speed, wavenumber = rng.uniform(30, 80), rng.uniform(1.5, 2.1)
+        wave = bowls(wavenumber, speed, 0.15, rng)
+        found = corner(wave, 1.0 + PLACES / speed, 1.8 * speed, refits=0)
+        ratios.append(np.log(found.value / (wavenumber * speed)) / found.sigma)
+    # chi-square of 16: 99.9 % lies below 39
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.57
+
+
+@pytest.mark.parametrize(("speed", "base", "length"), [(35.0, 2.7, 26.0), (80.0, 2.3, 22.0)])
+def test_an_unlisted_train_on_one_rail(speed, base, length):
+    car = np.array([0.0, base, 0.7 * length, 0.7 * length + base])
+    axles = (car + length * np.arange(5)[:, None]).ravel()
+    only = Catalogue((Catalogue.default()["articulated"],), "one type of another shape")
+    truth = Passage(axles, speed)
+    rate, x = record([truth], RAILS[:1], 25, kind="pulse", rates={"rail": 2000})["rail_a"]
+    (passage,) = (e for e in detect(rate, x, RAILS[0], only) if e.kind == "passage")
+    values = passage.values
+    assert values["grade"] == CONFIRMED and values["type"] == "unknown"
+    assert values["direction"] == "unknown"
+    assert values["axle_count"] == axles.size
+    # the sigma is that of what is known of wheelbases and of foundations beforehand
+    assert 0.03 < values["speed"].sigma / speed < 0.2
+    assert abs(values["speed"].value - speed) < 2.5 * values["speed"].sigma
+    low, high = values["speed_interval"]
+    assert low < values["speed"].value < high
+    times = 1e-9 * np.array([passage.stamp_ns, values["departure_ns"]])
+    assert np.allclose(times, truth.axle_times(0.0)[[0, -1]], atol=0.15 / speed)
