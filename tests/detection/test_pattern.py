@@ -30,4 +30,3 @@ def test_levels_of_successive_intervals():
     np.testing.assert_allclose(
         trace.levels(edges), trace.level(edges[:-1], edges[1:]), rtol=1e-9, atol=1e-12
     )
-    np.testing.assert_array_equal(trace.pattern_levels(edges), trace.levels(edges))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from .coherent import wheelsets
 from .kinematics import Fit, Motion, regress
 from .pattern import Trace
 from .place import CLIPPED_SIGMA, Wave, likelihood, locate
@@ -31,6 +32,7 @@ _MIRROR_SIGMAS = 8.0  # largest minus least of some thirty noisy cells is 4 to 5
 _MIRROR_RISE = 0.7  # ln, 3 dB: flatter levels have no axis
 _PLACE_LOW = 0.07  # m, scale of the error of the axis in the lowest band (half within 0.05 m, ...
 _PLACE_HIGH = 0.21  # m, ... one in twenty beyond 0.35 m) and in higher ones (0.17 m, 0.9 m)
+_CLOSE = 0.15  # m, scatter of energies below which deflections are not asked for
 _COVERED = 0.6  # part of a wheelset's window that must have been measured
 
 
@@ -42,6 +44,7 @@ class AxleFit:
     removed), contrast (ln of the energy at
     the wheelset over that beside it), observed. ``place_sigma`` is how well the pulses of each
     channel tell where the wheelsets are (m); their spacing is known far better.
+    ``in_phase`` is the ln of the likelihood that their deflections are there, if these placed them.
     """
 
     motion: Motion
@@ -52,6 +55,7 @@ class AxleFit:
     observed: NDArray[np.bool_]
     offset: Array
     place_sigma: Array
+    in_phase: float = 0.0
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -177,6 +181,38 @@ def _centre(
     return float((top - steps + fraction) * _STEP), rise
 
 
+def _by_deflection(
+    waves: Sequence[Wave],
+    places: Sequence[Array],
+    start: Motion,
+    observed: NDArray[np.bool_],
+    scatter: float,
+) -> tuple[Array, Motion, float] | None:
+    """Times of the wheelsets (s) by their deflection, if they scatter less than this (m)."""
+    found = wheelsets(waves, places, start)
+    if found is None:
+        return None
+    shift = found.shift.copy()
+    classes = _neighbours(places[0])
+    for c in np.unique(classes):
+        # as with energies: what leading and trailing wheelsets differ by is not the train's
+        own = shift[:, classes == c]
+        own -= np.median(own, axis=1, keepdims=True) - np.median(shift, axis=1, keepdims=True)
+        shift[:, classes == c] = own
+    due = found.motion.time_at(np.stack(list(places)))
+    time = due + shift / np.maximum(found.motion.speed_at(due), 0.5)
+    fit = regress(
+        time[observed],
+        np.stack(list(places))[observed],
+        np.nonzero(observed)[0],
+        found.motion.epoch,
+        position_sigma=_FREE_POSITION,
+    )
+    if fit.scale >= scatter or fit.motion.speed < 1.0:
+        return None
+    return time, fit.motion, found.gain
+
+
 def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
     """The wheelset times of one type under another of the same number of wheelsets.
 
@@ -265,12 +301,20 @@ def fit_axles(
             break
     place_sigma = np.full(len(traces), np.inf)
     residual = np.zeros(shape)
+    bent, in_phase = None, 0.0
+    if fit is not None and fit.scale > _CLOSE:
+        bent = _by_deflection(waves, places, start, observed, fit.scale)
+        if bent is not None:
+            time, motion, in_phase = bent
     if fit is not None:
         scales = np.full(len(traces), _PLACE_HIGH)
         due = motion.time_at(np.stack(list(places)))
         pace = np.maximum(motion.speed_at(due), 0.5)
         tables = []
         for k, trace in enumerate(anchors):
+            if bent is not None:
+                tables.append(likelihood(waves[k], motion, places[k]))
+                continue
             found = _centre(trace, motion, places[k], classes, 1.0)
             if found is None or found[1] < _MIRROR_RISE:
                 found = _centre(traces[k], motion, places[k], classes, reach)
@@ -295,4 +339,5 @@ def fit_axles(
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
         place_sigma=place_sigma,
+        in_phase=in_phase,
     )

@@ -207,7 +207,8 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
     All is scaled to one common speed (m/s), that types of one shape but another size are asked
     about the same waves.
     """
-    if not candidate.waves:
+    # clipping couples neighbours: two wheelsets of a bogie are no longer twice one pulse
+    if not candidate.waves or any(wave.clipped for wave in candidate.waves):
         return 0.0
     fit = candidate.fit
     scale = speed / float(motion.speed_at(motion.time_at(0.5 * places[-1])))

@@ -33,8 +33,7 @@ SCATTERED = 0.5
 pulses that have nothing to do with the type scatter by 0.635 m."""
 
 SCATTERED_SCORE = 0.70
-"""Least pattern correlation at which a type is named by the pattern of one channel alone. Two that
-show it in step are as significant at 0.535 (1 - r² is the root of that of one)."""
+"""Least pattern correlation at which a type is named by the pattern of one channel alone."""
 
 CLOCK_SCORE = 0.85
 """Least pattern correlation at which a clock, and not an unlisted train, is held responsible for
@@ -42,6 +41,13 @@ delays that no type explains: patterns of unlisted trains correlate with listed 
 
 SEEN = 0.5
 """ln of energy (2 dB) by which a wheelset that is seen rises over what is beside it."""
+
+IN_STEP_SCORE = 0.535
+"""Least pattern correlation of two channels in step, of a train whose deflection shows it too: as
+significant as :data:`SCATTERED_SCORE` of one (1 - r² is the root of that of one)."""
+
+IN_PHASE = 30.0
+"""ln of the likelihood at which the deflection shows a train: odds of e^20 after all its trials."""
 
 LEAST_SEEN = 8
 """Wheelsets of a pattern (two cars) to be seen on one channel, all where a train has fewer: three
@@ -143,6 +149,8 @@ class Passage:
             return False
         fit = self.hypotheses[0].fit
         seen = np.sum(fit.observed & (fit.contrast > SEEN), axis=1)
+        if fit.in_phase > IN_PHASE and self.direction != 0:
+            return self.score >= IN_STEP_SCORE
         if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))):
             return False
         scattered = fit.scale > SCATTERED

@@ -74,8 +74,8 @@ class Trace:
         floor: noise floor of the energy.
         step: bin length (s).
         within: interval of interest (s); outside it the trace is quiet.
-        limited: whether patterns are looked for in energy that no bin exceeds a typical wheelset:
-            wheel flats hit the rail where they please, far above the wheelsets, for a few ms.
+        limited: whether no bin counts more than a typical wheelset: wheel flats hit the rail where
+            they please, far above the wheelsets, for a few ms.
     """
 
     def __init__(
@@ -100,6 +100,8 @@ class Trace:
         if outside.any():
             filled = np.where(outside, floor, filled)
             known = np.flatnonzero(valid & ~outside)
+        if limited and known.size:
+            filled = np.minimum(filled, max(float(np.quantile(filled[known], _TYPICAL)), floor))
         self.energy = filled
         strong = float(np.percentile(filled[known], 97)) if known.size else floor
         self.noise = floor
@@ -107,10 +109,7 @@ class Trace:
         # a stream with a gap of several seconds has unequal bins: integrate over real time
         edges = np.concatenate([time - step / 2, time[-1:] + step / 2])
         self._ends = float(edges[0]), float(edges[-1])
-        self._energy = self._limited = Integral(edges, filled)
-        if limited and known.size:
-            typical = max(float(np.quantile(filled[known], _TYPICAL)), self.base)
-            self._limited = Integral(edges, np.minimum(filled, typical))
+        self._energy = Integral(edges, filled)
         self._known = Integral(edges, valid.astype(np.float64))
 
     def mean(self, start: Array, stop: Array) -> Array:
@@ -131,11 +130,6 @@ class Trace:
     def levels(self, edges: Array) -> Array:
         """The level between successive times (s) along the last axis."""
         total = np.diff(self._energy(edges))
-        return self._level(self._over(total, edges[..., :-1], edges[..., 1:]))
-
-    def pattern_levels(self, edges: Array) -> Array:
-        """The levels in which patterns are looked for, limited if so asked."""
-        total = np.diff(self._limited(edges))
         return self._level(self._over(total, edges[..., :-1], edges[..., 1:]))
 
     def coverage(self, start: Array, stop: Array) -> Array:
@@ -193,7 +187,7 @@ def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: 
     reachable = square > 0.01 * v * v
     root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
     times = epoch + 2 * edges / (v + root)
-    level = trace.pattern_levels(times)
+    level = trace.levels(times)
     return np.asarray(np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0))
 
 
