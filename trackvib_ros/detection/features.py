@@ -41,6 +41,7 @@ _INNER_RATE = 5000.0  # Hz, band filters run at this rate or up to twice it
 _INNER_TOP = 1700.0  # Hz
 _RECURSIVE = np.array([1.0, 0.0])  # keeps lfilter from convolving, whose rounding follows the block
 _FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
+_MEAN_S = 0.06  # before a long hole, half the memory of the lowest band's high-pass
 _SETTLE_S = 0.05  # bins after a hole that the filters still remember
 _MAX_GAP_S = 5.0  # longer gaps restart the stream
 
@@ -200,6 +201,8 @@ class GroupStream:
         self.end_ns: int | None = None
         self._zi: list[Array] | None = None
         self._last = np.full(n, np.nan)
+        self._held = np.zeros(n)
+        self._past = np.full((max(1, int(_MEAN_S * self.rate)), n), np.nan)
         self._in_hole = np.zeros(n, dtype=bool)
         # the filters start on one sample, whose own departure from the mean must fade
         self._unsettled = np.full(n, int(_SETTLE_S * self.rate))
@@ -239,6 +242,7 @@ class GroupStream:
         self._consume(self._pending_count, flush=True)
         self._pending, self._pending_count = [], 0
         self._zi = None
+        self._past[:] = np.nan
         self._unsettled[:] = int(_SETTLE_S * self.rate)
         self.restarts += 1
 
@@ -273,6 +277,7 @@ class GroupStream:
             invalid = holes > 0
             self._last = x[-1].copy()
             self._in_hole[:] = False
+        self._past = np.concatenate([self._past, x[-len(self._past) :]])[-len(self._past) :]
         if (unsettled > 0).any():
             invalid |= np.arange(len(invalid))[:, None] * self.decimation < unsettled
         self._filter(x, holes, invalid)
@@ -320,7 +325,9 @@ class GroupStream:
                     weight = np.arange(1, stop - first + 1) / (last - first + 1)
                     x[first:stop, c] = before + weight * (raw[last, c] - before)
                 else:
-                    x[first:stop, c] = before
+                    if not (carried and first == 0):
+                        self._held[c] = self._mean_before(x[:first, c], c, before)
+                    x[first:stop, c] = self._held[c]
                     settled = int(_SETTLE_S * self.rate)
                     invalid[first : stop + settled, c] = True
                     self._in_hole[c] = stop == count
@@ -329,6 +336,12 @@ class GroupStream:
         shape = (count // self.decimation, self.decimation, x.shape[1])
         holes = bad[:count].reshape(shape).mean(axis=1)
         return x, holes, np.asarray(invalid.reshape(shape).any(axis=1))
+
+    def _mean_before(self, x: Array, channel: int, last: float) -> float:
+        """Mean of a channel before a hole: a last sample off it would step out of the filters."""
+        known = np.concatenate([self._past[:, channel], x])[-len(self._past) :]
+        known = known[np.isfinite(known)]
+        return float(known.mean()) if known.size else last
 
     def _filter(self, x: Array, holes: Array, invalid: NDArray[np.bool_]) -> None:
         n, d = len(x) // self.decimation, self.decimation
