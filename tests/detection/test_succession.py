@@ -1,9 +1,10 @@
-"""One train after another: the first is told when none of its wheelsets can follow any more."""
+"""One train after another, and two at once."""
 
 import numpy as np
+import pytest
 
 from tests.detection.synthetic import CATALOGUE, RAILS, Passage, record
-from trackvib_ros.detection import TrainDetector
+from trackvib_ros.detection import TrainDetector, detect
 from trackvib_ros.detection.closing import Closing
 from trackvib_ros.waveform import Waveform
 
@@ -60,3 +61,21 @@ def test_succession_does_not_depend_on_the_blocks():
     samples = pair(1.2)[2]
     events = [[event for _, event in told(samples, block)] for block in (90, 4000)]
     assert events[0] == events[1]
+
+
+@pytest.mark.parametrize(("kind", "level"), [("pulse", 0.2), ("burst", 0.2)])
+def test_a_train_on_the_neighbouring_track(kind, level):
+    """One that comes the other way, 14 dB weaker, does no harm."""
+    own = Passage(CATALOGUE["CRH3"].axles, 60.0)
+    other = Passage(
+        CATALOGUE["articulated"].axles, 50.0, start=own.start + 0.7, direction=-1, level=level
+    )
+    signals = record([own, other], RAILS, 20, seed=3, rates={"rail": RATE}, kind=kind)
+    samples = np.stack([signals[c.name][1] for c in RAILS], axis=1)
+    (passage,) = [event for event in detect(RATE, samples, RAILS) if event.kind == "passage"]
+    speed = passage.values["speed"]
+    assert abs(speed.value / own.speed - 1) < 0.004
+    assert abs(speed.value - own.speed) < 2.5 * speed.sigma
+    assert passage.values["type"] == "CRH3" and passage.values["direction"] == "forward"
+    assert passage.values["axle_count"] == own.axles.size
+    assert abs(passage.stamp_ns * 1e-9 - own.axle_times(0.0)[0]) < 0.005
