@@ -88,6 +88,7 @@ class Explanation:
             with other gaps; ``clock`` the type, and the clock of ``channel`` is off.
         probability: posterior.
         motion: under this model, with covariance.
+        phase: log likelihood of the low-passed waveforms under it against noise.
     """
 
     candidate: int
@@ -95,6 +96,7 @@ class Explanation:
     probability: float
     motion: Motion
     channel: int = -1
+    phase: float = 0.0
 
 
 def _classes(places: Array) -> NDArray[np.int64]:
@@ -226,8 +228,7 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
         else places
         for time, seen in zip(fit.time, fit.observed, strict=True)
     ]
-    # wheelsets that only rattle have no such pulse
-    return float(np.logaddexp(0.0, agreement(candidate.waves, motion, ahead).log))
+    return agreement(candidate.waves, motion, ahead).log
 
 
 def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
@@ -310,12 +311,14 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
         return []
     # some unlisted train explains the waveforms as well as any model that was tried
     best_phase = max(f[1] for f in found)
-    logs = np.array([f[0] + (best_phase if f[3] in ("scaled", "varied") else f[1]) for f in found])
+    # wheelsets that only rattle have no pulse below 100 Hz: then noise explains the waveforms
+    phases = [best_phase if f[3] in ("scaled", "varied") else f[1] for f in found]
+    logs = np.array([f[0] for f in found]) + np.logaddexp(0.0, phases)
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     out = [
-        Explanation(index, kind, float(w), motion, channel)
-        for w, (_, _, index, kind, channel, motion) in zip(weights, found, strict=True)
+        Explanation(index, kind, float(w), motion, channel, phase)
+        for w, (_, phase, index, kind, channel, motion) in zip(weights, found, strict=True)
     ]
     return sorted(out, key=lambda e: -e.probability)
 

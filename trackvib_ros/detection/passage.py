@@ -28,9 +28,10 @@ CONFIRM_SCORE = 0.60
 KNOWN_SCORE = 0.62
 """Least pattern correlation at which a catalogue type is named."""
 
-SCATTERED = 0.5
-"""Scatter (m) of wheelsets about their places at which these tell nothing: in windows of 2.2 m
-pulses that have nothing to do with the type scatter by 0.635 m."""
+SCATTERED = 0.45
+"""Scatter (m) of wheelsets about their places at which these tell too little: in windows of 2.2 m
+pulses that have nothing to do with the type scatter by 0.635 m; here half of that variance is
+left."""
 
 SCATTERED_SCORE = 0.70
 """Least pattern correlation at which a type is named by the pattern of one channel alone."""
@@ -86,6 +87,7 @@ class Hypothesis:
     score: float
     fit: AxleFit
     probability: float = 0.0
+    phase: float = 0.0  # log likelihood of the low-passed waveforms against noise
 
     @property
     def places(self) -> Array:
@@ -155,7 +157,9 @@ class Passage:
             return False
         scattered = fit.scale > SCATTERED
         alone = self.direction == 0
-        return self.score >= (SCATTERED_SCORE if scattered and alone else least)
+        # unless the deflection under the wheels shows the type
+        doubted = scattered and alone and self.hypotheses[0].phase <= 0
+        return self.score >= (SCATTERED_SCORE if doubted else least)
 
     @property
     def confirmed(self) -> bool:
@@ -567,10 +571,12 @@ def _with_probabilities(
     total = np.zeros(len(trains))
     related = np.zeros(len(trains))
     motion: dict[int, Motion] = {}
+    phase: dict[int, float] = {}
     unknown = sum(e.probability for e in explanations if e.kind in ("scaled", "varied")) > 0.5
     for e in explanations:
         if e.kind == "type":
             total[e.candidate] += e.probability
+            phase[e.candidate] = e.phase
         related[e.candidate] += e.probability
         if (e.kind == "type") != unknown:
             motion.setdefault(e.candidate, e.motion)
@@ -579,6 +585,7 @@ def _with_probabilities(
         replace(
             trains[i],
             probability=float(total[i]),
+            phase=phase.get(int(i), 0.0),
             fit=replace(trains[i].fit, motion=motion.get(int(i), trains[i].fit.motion)),
         )
         for i in order

@@ -205,9 +205,9 @@ def _prefer_blind(passage: Passage, blind: Blind) -> bool:
 def _speed(passage: Passage) -> tuple[float, float, float, tuple[float, float]]:
     """Speed at mid-train (m/s), its sigma under the best explanation and over all, 95 % interval.
 
-    The interval leaves out what is less likely than one in twenty. With one channel the sigma
-    contains the small chance that the train is a relative of the type, some percent larger or
-    smaller; with two it is that of the interval.
+    The interval leaves out what is less likely than one in twenty, and the sigma is that of the
+    interval. With one channel and no deflection that shows the type, the sigma contains the small
+    chance that the train is a relative of it, some percent larger or smaller.
     """
     best = passage.hypotheses[0]
     when = best.mid_time
@@ -230,7 +230,8 @@ def _speed(passage: Passage) -> tuple[float, float, float, tuple[float, float]]:
     variance = sum(w * ((v - speed) ** 2 + s**2) for w, v, s in parts) / total
     half = max(half_interval(parts, speed), 1.96 * own)
     # the delay between two channels bounds the size of an unlisted train; one channel cannot
-    sigma = half / 1.96 if len(passage.traces) > 1 else max(variance**0.5, own)
+    shown = len(passage.traces) > 1 or (passage.known and best.phase > 0)
+    sigma = half / 1.96 if shown else max(variance**0.5, own)
     return speed, own, sigma, (speed - half, speed + half)
 
 
