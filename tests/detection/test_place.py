@@ -119,3 +119,9 @@ def test_trains_that_differ_by_centimetres_are_told_apart_as_surely_as_is_said()
     spread = np.sqrt(np.sum(said * (1 - said)))
     assert abs(np.sum(right) - np.sum(said)) < 3 * spread
     assert np.sum(right) > 45 and np.mean(said) > 0.75
+
+
+@pytest.mark.parametrize("places", [-AXLES, 0 * AXLES, np.nan * AXLES])
+def test_places_of_no_train_agree_with_nothing(places):
+    given, motion = wave(30.0, 0.0, 0.1, 0)
+    assert agreement([given], motion, [places]).log == 0.0

@@ -213,7 +213,10 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
     if not candidate.waves or any(wave.clipped for wave in candidate.waves):
         return 0.0
     fit = candidate.fit
-    scale = speed / float(motion.speed_at(motion.time_at(0.5 * places[-1])))
+    own = float(motion.speed_at(motion.time_at(0.5 * places[-1])))
+    if not (np.all(np.diff(places) > 0) and own > 0):
+        return 0.0
+    scale = speed / own
     motion = Motion(
         motion.epoch,
         scale * motion.distance,

@@ -158,7 +158,8 @@ class Passage:
         scattered = fit.scale > SCATTERED
         alone = self.direction == 0
         # unless the deflection under the wheels shows the type
-        doubted = scattered and alone and self.hypotheses[0].phase <= 0
+        shown = self.hypotheses[0].phase > 0 and self.unknown < 0.5
+        doubted = scattered and alone and not shown
         return self.score >= (SCATTERED_SCORE if doubted else least)
 
     @property

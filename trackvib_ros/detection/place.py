@@ -212,6 +212,8 @@ def spectrum(
         top: largest wavenumber (rad/m) instead of that of a deflection.
     """
     start, length = float(places[0]), float(places[-1] - places[0])
+    if not (np.isfinite(length) and length > 0 and _mid_speed(motion, places) > 0):
+        return None
     found = _against_distance(wave, _from(motion, start), length)
     if found is None:
         return None
