@@ -36,7 +36,7 @@ HUMP, HUMP_FINE = 0.5, 0.2
 """Of the log-energy at a wheelset (m), and its smoothing."""
 
 _SPEEDS = 60  # of the grid on which the spectrum of the deflection is looked at
-_TRIALS = 4  # speeds at which wheelsets are looked for
+_TRIALS = 6  # speeds at which wheelsets are looked for
 _APART = 1.2  # ratio of different trials
 _LEVELS = (0.3, 0.5, 0.7, 1.0)
 _ROUGHNESS = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the bowl's highest density
@@ -203,7 +203,8 @@ def _deflected(
             out.append(_weighed(wave, trial, found, times, wavenumber, 2))
             if out[-1].corner is None:
                 break
-            if found.certainty > _SURE and found.explained > _ALL * possible:
+            good = found.certainty > _SURE and found.explained > _ALL * possible
+            if good and out[-1].base[2] > _PAIRED and out[-1].gain > 0:
                 return out, True
             trial = out[-1].corner.value / wavenumber
     return out, False
