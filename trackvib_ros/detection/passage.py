@@ -370,7 +370,7 @@ def find_passage(
         trains: candidate types.
         limits: lowest and highest speed (m/s).
         site: where the channels are.
-        unlisted: whether to describe what no type explains.
+        unlisted: whether to describe what no type explains, and to try types that explain little.
     """
     scanned = [
         found
@@ -385,7 +385,7 @@ def find_passage(
         max(scanned, key=lambda s: s.score)
     ]
     reference = usable[0]
-    if top < HOPELESS_SCORE:
+    if top < (HOPELESS_SCORE if unlisted else CONFIRM_SCORE):
         traces = tuple(s.trace for s in scanned)
         passage = Passage(reference.interval, traces, reference.band, (), 0, coarse_score=top)
     else:
