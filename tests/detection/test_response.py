@@ -81,6 +81,11 @@ def test_the_comb_is_the_transform_of_the_wheelset_times() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
+def test_a_comb_of_no_frequencies_is_empty() -> None:
+    none = comb(SHIPPED["metro"].axles, np.zeros(0), np.array([20.0]), np.array([0.0]))
+    assert none.shape == (1, 0)
+
+
 def _first(places: Array, v: float, a: float) -> float:
     return float(2 * places[0] / (v + np.sqrt(v**2 + 2 * a * places[0])))
 
@@ -158,6 +163,16 @@ def test_strain_gauge_with_drift_in_counts(name: str, speed: float) -> None:
     # the noise alone would allow 1e-4; the gauge drifts and its filter smooths the kinks
     assert found.value == pytest.approx(speed, rel=2e-3)
     assert abs(found.value - speed) < 4 * found.sigma
+
+
+def test_a_slow_train_on_a_strain_gauge_is_one_event() -> None:
+    """At 11 m/s a span of 20 m answers below 1 Hz, and the bogies of a car are seconds apart."""
+    times = wheelset_times("metro", 11.0)
+    x = recorded(times, 200.0, ("strain", 11.0), 0.05, 9)
+    events = detect(200.0, x, [Channel("gauge", 0.0, "bridge")], known("metro"))
+    told = [e for e in events if e.kind in ("arrival", "departure")]
+    assert [e.kind for e in told] == ["arrival", "departure"]
+    assert abs(told[0].stamp_ns * 1e-9 - times[0]) < 20.0 / 11.0
 
 
 def test_two_bridge_channels_share_a_motion_but_no_direction() -> None:

@@ -230,7 +230,8 @@ class TrainDetector:
                     f"dt_ns = {block.dt_ns} ns must be positive and at most 20 000 000 ns (50 Hz)"
                 )
             index = [self._index[n] for n in block.channels]
-            group = Group(block, index, self._keep_s, len(self.channels))
+            slow = all(self.channels[i].layer == "bridge" for i in index)
+            group = Group(block, index, self._keep_s, len(self.channels), slow)
             self._groups[block.channels] = group
         if block.data.ndim != 2 or block.data.shape[1] != len(block.channels):
             raise InputError(

@@ -33,6 +33,10 @@ high-pass): the slow pulse of a wheel at 40 km/h keeps its symmetry and its plac
 LOW_TOP = 100.0
 """Edge (Hz) of the low-passed waveform, a Bessel filter of second order."""
 
+SLOW = (0.7, 10.0)
+"""Frequency band (Hz) of the load itself, which channels on a bridge have besides: under a train of
+60 km/h a gauge on a span of 20 m shows little above 1 Hz."""
+
 FRAME_S = 0.01
 """Length of a decision frame (s), nearly: a whole number of bins."""
 
@@ -95,9 +99,9 @@ class Frame:
     mean: Array
 
 
-def bands_for(rate: float) -> tuple[tuple[float, float], ...]:
-    """The bands that a sampling rate (Hz) can show."""
-    usable = [(low, min(high, 0.45 * rate)) for low, high in BANDS]
+def bands_for(rate: float, slow: bool = False) -> tuple[tuple[float, float], ...]:
+    """The bands that a sampling rate (Hz) can show; with :data:`SLOW` last."""
+    usable = [(low, min(high, 0.45 * rate)) for low, high in (*BANDS, *([SLOW] if slow else []))]
     kept = tuple(band for band in usable if band[1] >= 2 * band[0])
     return kept or ((0.02 * rate, 0.45 * rate),)
 
@@ -131,13 +135,15 @@ class GroupStream:
 
     Attributes:
         step: length of a bin (s).
-        bands: frequency limits (Hz).
+        bands: frequency limits (Hz), with :data:`SLOW` if asked for.
         shift: group delay per band (s).
         freedom: degrees of freedom of a bin's energy per band, white noise.
         end_ns: time after the newest sample.
     """
 
-    def __init__(self, channels: tuple[str, ...], dt_ns: int, keep_s: float) -> None:
+    def __init__(
+        self, channels: tuple[str, ...], dt_ns: int, keep_s: float, slow: bool = False
+    ) -> None:
         self.channels = channels
         self.dt_ns = dt_ns
         self.rate = 1e9 / dt_ns
@@ -148,7 +154,7 @@ class GroupStream:
         self.frame_bins = max(1, round(FRAME_S / self.step))
         self.frame_s = self.frame_bins * self.step
         self._to_end_ns = dt_ns * (self.decimation - (self.decimation - 1) // 2)
-        self.bands = bands_for(self.rate)
+        self.bands = bands_for(self.rate, slow)
         top = min(_INNER_TOP, 0.45 * self.rate)
         self._front = signal.bessel(4, top, "low", norm="mag", fs=self.rate, output="sos")
         self._sos = [

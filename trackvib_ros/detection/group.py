@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from trackvib_ros.waveform import Waveform
 
 from .events import Channel
-from .features import GroupStream
-from .onset import WARM_UP, Onset, Trigger, quietest
+from .features import SLOW, GroupStream
+from .onset import WARM_UP, Onset, Trigger, margins, quietest
 from .record import Record
 
 Array = NDArray[np.float64]
@@ -25,6 +25,7 @@ class Group:
         index: place of each of its channels in the detector.
         keep_s: features are kept for so long (s).
         sharing: channels of the detector that share its rate of false arrivals.
+        slow: whether the load itself is heard, below 5 Hz.
 
     Attributes:
         next_bin: first bin of the next decision frame.
@@ -32,8 +33,10 @@ class Group:
         watching: whether an onset is looked for.
     """
 
-    def __init__(self, block: Waveform, index: list[int], keep_s: float, sharing: int) -> None:
-        self.stream = GroupStream(block.channels, block.dt_ns, keep_s)
+    def __init__(
+        self, block: Waveform, index: list[int], keep_s: float, sharing: int, slow: bool = False
+    ) -> None:
+        self.stream = GroupStream(block.channels, block.dt_ns, keep_s, slow)
         self.index = index
         self.next_bin = 0
         self.calm_s = 0.0
@@ -50,13 +53,21 @@ class Group:
     def louder_before(self, factor: float) -> bool:
         """Whether the recent level is lower than the first noise floor by a factor."""
         recent = self.trigger.recent
-        return bool(np.any((recent > 0) & (self.trigger.first_floor > factor * recent)))
+        fell = (recent > 0) & (self.trigger.first_floor > factor * recent)
+        return bool(np.any(fell & ~self._slow))
 
     def quietest(self, until_ns: int) -> Array:
         """Noise floors by the quietest stretch up to a time, (channels, bands)."""
         stream = self.stream
         rows = (stream.measured(row, until_ns) for row in range(len(self.index)))
-        return np.stack([quietest(row, stream.bands, stream.frame_s) for row in rows])
+        found = np.stack([quietest(row, stream.bands, stream.frame_s) for row in rows])
+        # its filter remembers nearly a second: at first it shows how the record begins
+        return np.where(self._slow, np.fmax(found, self.trigger.first_floor), found)
+
+    @property
+    def _slow(self) -> NDArray[np.bool_]:
+        """Which bands lie below all others: that of the load."""
+        return np.array([band == SLOW for band in self.stream.bands])
 
     def begin_again(self, floor: Array) -> None:
         """Take the frames from the first one on, with noise floors (channels, bands)."""
@@ -86,7 +97,8 @@ class Group:
             return None, []
         valid = valid & ready
         with np.errstate(invalid="ignore"):
-            ratio = np.where(valid[..., None], energy / self.trigger.floor, 0.0)
+            floor = self.trigger.floor * margins(self.stream.bands)
+            ratio = np.where(valid[..., None], energy / floor, 0.0)
         statistic = self.onset.look(ratio, valid, self.stream.freedom * self.trigger.whiteness)
         over = statistic.mean(axis=2) > self.onset.threshold
         found = []

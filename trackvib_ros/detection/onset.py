@@ -30,6 +30,8 @@ WARM_UP = 50
 """Frames from which a floor is learned."""
 
 _FALSE_ALARM = 1e-9  # per test, Gaussian noise: 0.007 an hour and channel before the margin
+_WARM_UP_S = 0.5
+_UNLUCKY, _FEW = 1e-3, 10.0
 _MARGIN = 1.2  # the floor itself is an estimate
 _LEAST_RATIO = 1.6
 _FLOOR_FRAMES = 800.0  # time constant of the floor
@@ -104,7 +106,17 @@ def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
         for b, (low, high) in enumerate(bands):
             freedom = max(1.0, 2 * (high - low) * frames * frame_s)
             table[w, b] = stats.chi2.isf(_FALSE_ALARM, freedom) / freedom
-    return np.maximum(_MARGIN * table, _LEAST_RATIO)
+    return np.maximum(_MARGIN * table, _LEAST_RATIO) * margins(bands)
+
+
+def margins(bands: tuple[tuple[float, float], ...]) -> Array:
+    """Factor by which energy must rise more than by chance, because the floor is known no better.
+
+    Where it was learned in half a second from few degrees of freedom, it may be too low by as much
+    as the chi-square law allows once in a thousand times.
+    """
+    freedom = np.array([max(2 * (high - low) * _WARM_UP_S, 1.0) for low, high in bands])
+    return np.where(freedom < _FEW, freedom / stats.chi2.ppf(_UNLUCKY, freedom), 1.0)
 
 
 def quietest(energy: Array, bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:

@@ -27,6 +27,7 @@ from scipy import fft
 from .catalogue import TrainType
 from .events import Channel
 from .evidence import PRIOR_UNKNOWN
+from .features import SLOW
 from .kinematics import PRIOR_ACCELERATION, Motion
 from .record import Record
 from .unlisted import ALTERNATIVES, CAR, CHOICES, EqualCars, starts
@@ -45,7 +46,7 @@ CORRELATED = 2.5
 """Misfit is not white: its neighbouring coefficients go together, so that this many count as one.
 Mean square of error over sigma of the speed on computed passages when counted as independent."""
 
-_SYSTEMATIC = 0.03
+_SYSTEMATIC = 0.05
 """Share of the evidence by which models of like trains differ because none is exact, in units of
 one e-fold of belief: of 27 computed passages of a metro two had the nearest other metro, and five a
 train of somewhat other proportions, more than a fifth better than itself."""
@@ -145,7 +146,7 @@ class Spectrum:
     @property
     def usable(self) -> bool:
         """Whether there is something to compare."""
-        return self.f.size >= 8
+        return self.f.size >= 8 and bool(np.any(self.y))
 
 
 def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexArray:
@@ -162,6 +163,8 @@ def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexA
     v, a = speed[:, None], acceleration[:, None]
     root = np.sqrt(np.maximum(v * v + 2 * a * places, 0.01 * v * v))
     times = 2 * places / (v + root)
+    if not f.size:
+        return np.zeros((speed.size, 0), dtype=np.complex128)
     # frequency i + block j is a product of two phases: far fewer exponentials, and a matrix product
     block = max(1, round(float(np.sqrt(f.size))))
     blocks = -(-f.size // block)
@@ -311,11 +314,14 @@ class ResponseFit:
 def strong_extent(record: Record, within: tuple[float, float]) -> tuple[float, float] | None:
     """Times (s) of 5 and 95 % of the energy above the floor, in the band where they are closest.
 
-    What rings on lengthens it, in some bands more than in others.
+    What rings on lengthens it, in some bands more than in others. The load itself, slower than 5
+    Hz, counts where nothing else shows.
     """
     window = record.window
-    found = []
-    for b in range(len(window.bands)):
+    found: list[tuple[float, float, float]] = []
+    for b in sorted(range(len(window.bands)), key=lambda b: window.bands[b] == SLOW):
+        if window.bands[b] == SLOW and found:
+            break
         time = window.time - window.shift[b]
         inside = (time > within[0]) & (time < within[1]) & window.valid
         energy = np.maximum(window.energy[inside, b] - record.floor[b], 0)
@@ -492,6 +498,8 @@ class _Search:
             for r in _REACHES if first else (reach,):
                 for ring in _RINGS if first else (old.after - old.before,):
                     spectrum = Spectrum(seen, 2 * r / reference + ring, reference / wave)
+                    if not spectrum.usable:
+                        continue
                     model = Model(spectrum, r / reference, r / reference + ring, old.misfit)
                     free = max(reach - r, 0.0) / reference
                     centres = old.centre + np.linspace(-free, free, 5 if free else 1)
@@ -500,8 +508,8 @@ class _Search:
                     i = int(np.argmax(values))
                     if best is None or values[i] > best[0]:
                         best = float(values[i]), replace(model, centre=float(centres[i]))
-            assert best is not None
-            models.append(best[1])
+            # too few coefficients on finer waves: the coarser ones stay
+            models.append(old if best is None else best[1])
         return self.weighted(replace(fit, models=tuple(models)))
 
     def beside(self, fit: ResponseFit, wave: float) -> ResponseFit:
@@ -781,6 +789,8 @@ def _spectral(fit: ResponseFit, k: int) -> tuple[float, float] | None:
     model = fit.models[k]
     s = model.spectrum
     low = s.f <= fit.speed / _COARSE
+    if not low.any():
+        return None
     v = fit.speed * np.exp(np.arange(-0.8, 0.8, 0.1 * _COARSE / fit.train.span))
     power = np.abs(s.y[low]) ** 2
     bend = np.full(v.size, fit.acceleration)
