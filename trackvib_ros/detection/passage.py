@@ -60,6 +60,10 @@ HOPELESS_SCORE = 0.40
 _CERTAIN = 0.99
 """Probability of a type, by its pattern alone, that teaches where the channels are."""
 
+# of the rise (ln) of all wheelsets, least one of those of two cars at either end: about 0 where no
+# train is, nine tenths and more where one is, down to 0 dB
+_ENDS = 1 / 3
+
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
 
 _AROUND_S = 0.5  # s, of an interval of strong energy that belongs to its train
@@ -143,7 +147,17 @@ class Passage:
     @property
     def known(self) -> bool:
         """Whether a catalogue type explains the pattern."""
-        return self._patterned(KNOWN_SCORE) and self.unknown < 0.5
+        return self._patterned(KNOWN_SCORE) and self.unknown < 0.5 and self._covered
+
+    @property
+    def _covered(self) -> bool:
+        """Whether, on one channel, no end of the pattern lies where the rail is quiet."""
+        if self.direction != 0 or len(self.traces) > 1:
+            return True
+        contrast = self.hypotheses[0].fit.contrast[0]
+        ends = contrast[:LEAST_SEEN], contrast[-LEAST_SEEN:]
+        least = _ENDS * float(np.median(contrast))
+        return all(float(np.median(end)) > least for end in ends)
 
     def _patterned(self, least: float) -> bool:
         """Whether a type's pattern is seen with this correlation, or clearly without wheelsets."""
