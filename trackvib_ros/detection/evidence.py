@@ -312,8 +312,8 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             found.append((log + prior + log_prior, phase, index, kind, channel, motion))
     if not found:
         return []
-    # some unlisted train explains the waveforms as well as any model that was tried
-    best_phase = max(f[1] for f in found)
+    # trains are built with tolerances, which show: waveforms choose among listed types only
+    best_phase = max((f[1] for f in found if f[3] in ("type", "clock")), default=0.0)
     # wheelsets that only rattle have no pulse below 100 Hz: then noise explains the waveforms
     phases = [best_phase if f[3] in ("scaled", "varied") else f[1] for f in found]
     logs = np.array([f[0] for f in found]) + np.logaddexp(0.0, phases)
