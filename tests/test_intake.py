@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 from sensor_msgs.msg import PointCloud2
 
+from solver import InputError
+from tests.detection.synthetic import CATALOGUE, RAILS, Passage, blocks, record
 from trackvib_ros import messages as m
-from trackvib_ros.detection import Channel
+from trackvib_ros.detection import Calibration, Channel
 from trackvib_ros.intake import Intake
 from trackvib_ros.waveform import Waveform
 
@@ -81,3 +86,40 @@ def test_jitter_of_the_stamps_is_neither_gap_nor_past() -> None:
         intake.take("a/waveform", message)
     assert intake.blocks["a/waveform"] == 100
     assert not intake.refused and not intake.gaps
+
+
+def test_what_passages_teach_outlives_the_process(tmp_path: Path) -> None:
+    file = tmp_path / "site.json"
+    rails = {"rail/waveform": list(RAILS)}
+    train = record([Passage(CATALOGUE["metro"].axles, 45.0)], RAILS, 30, 0, kind="pulse")
+    intake = Intake(rails, file)
+    for data in blocks(train, 0.5):
+        intake.take("rail/waveform", m.waveform_message(replace(data, frame_id="rail")))
+    learned = Calibration.load(file)  # kept as soon as the train is told
+    intake.finish()
+    assert learned.passages == 1
+    # neither the end of the stream nor of the process forgets it
+    assert intake.detector.calibration.to_json() == learned.to_json()
+    assert Intake(rails, file).detector.calibration.to_json() == learned.to_json()
+    moved = {"rail/waveform": [RAILS[0], replace(RAILS[1], x=RAILS[1].x + 0.5)]}
+    with pytest.raises(InputError, match=r"learned with .* at x = 20.0 m"):
+        Intake(moved, file)
+    with pytest.raises(InputError, match="no directory"):
+        Intake(rails, tmp_path / "nowhere" / "site.json")
+    assert Calibration.load(file).to_json() == learned.to_json()
+
+
+def test_a_file_that_cannot_be_written_is_told_and_events_are_not_lost(tmp_path: Path) -> None:
+    file = tmp_path / "here" / "site.json"
+    file.parent.mkdir()
+    intake = Intake({"rail/waveform": list(RAILS)}, file)
+    file.parent.rmdir()
+    train = record([Passage(CATALOGUE["metro"].axles, 45.0)], RAILS, 30, 0, kind="pulse")
+    events = []
+    for data in blocks(train, 0.5):
+        events += intake.take("rail/waveform", m.waveform_message(replace(data, frame_id="rail")))
+    events += intake.finish()
+    assert [e.values["type"] for e in events if e.kind == "passage"] == ["metro"]
+    warning, _ = intake.state([])
+    assert warning is not None
+    assert "cannot be written" in warning

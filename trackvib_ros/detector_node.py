@@ -104,16 +104,17 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
     def _on_channels(self, message: DiagnosticArray) -> None:
         try:
             channels = m.read_channels(message)
+            if self._listening is None or channels != self._listening.channels:
+                self._be_quiet()
+                self._listen(channels)
         except InputError as failure:
             self.get_logger().error(str(failure))
-            return
-        if self._listening is None or channels != self._listening.channels:
-            self._be_quiet()
-            self._listen(channels)
 
     def _listen(self, channels: dict[str, list[Channel]]) -> None:
         qos = m.BEST_EFFORT_STREAM if value(self, "best_effort") else m.STREAM
-        self._listening = Listening(self, channels, qos, self._publish)
+        kept = value(self, "calibration_file")
+        file = Path(kept) if kept else None
+        self._listening = Listening(self, channels, qos, self._publish, file)
 
     def _be_quiet(self) -> None:
         if self._listening is not None:

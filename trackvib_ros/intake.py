@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from solver import InputError
-from trackvib_ros.detection import Channel, TrainDetector, TrainEvent
+from trackvib_ros.detection import Calibration, Channel, TrainDetector, TrainEvent
 from trackvib_ros.messages import read_waveform
 from trackvib_ros.waveform import Waveform
 
@@ -45,18 +46,28 @@ class Intake:
 
     Args:
         channels: the accelerometers by topic.
+        calibration: file that keeps what passages teach of the site, read at the start if it is
+            there; none by default.
 
     Attributes:
+        not_kept: why the file could not be written, if so.
         blocks: blocks accepted, by topic.
         refused: blocks refused, by ``topic: reason``.
         last_refusal: the whole sentence of the last refusal.
         gaps: gaps in the stamps, by topic.
         missing_ns: simulated time missing in those gaps, by topic (ns).
         restarts: times that the sources started anew.
+
+    Raises:
+        InputError: the file is no calibration of these channels, or cannot be.
     """
 
-    def __init__(self, channels: dict[str, list[Channel]]) -> None:
-        self.detector = TrainDetector([c for group in channels.values() for c in group])
+    def __init__(self, channels: dict[str, list[Channel]], calibration: Path | None = None) -> None:
+        self._file = calibration
+        self._kept = None if calibration is None else _read(calibration)
+        group = [c for group in channels.values() for c in group]
+        self.detector = TrainDetector(group, calibration=self._kept)
+        self.not_kept = ""
         self.blocks: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.last_refusal = ""
@@ -86,8 +97,7 @@ class Intake:
 
     def finish(self) -> list[TrainEvent]:
         """End of the stream: what the detector still has to say; it forgets everything."""
-        events = self.detector.finish()
-        self.detector.reset()
+        events = self._end()
         for source in self._sources.values():
             source.next_ns = None
         return events
@@ -98,6 +108,8 @@ class Intake:
         warnings = [f"no publisher on {', '.join(silent)}"] if silent else []
         if refused:
             warnings.append(f"{refused} blocks refused, the last: {self.last_refusal}")
+        if self.not_kept:
+            warnings.append(self.not_kept)
         if self.gaps:
             warnings.append(f"{sum(self.missing_ns.values()) * 1e-9:.3f} s missing in gaps")
         figures: dict[str, object] = {"restarts": self.restarts, "refused": refused}
@@ -105,6 +117,28 @@ class Intake:
         figures |= {f"refused {reason}": n for reason, n in self.refused.items()}
         figures |= {f"gaps {topic}": n for topic, n in self.gaps.items()}
         return "; ".join(warnings) or None, figures
+
+    def _end(self) -> list[TrainEvent]:
+        """What the detector still has to say; then it forgets all but what is kept in the file."""
+        events = self.detector.finish()
+        self._keep()
+        if self._file is None:
+            self.detector.reset()
+        else:
+            self.detector = TrainDetector(
+                self.detector.channels, calibration=self.detector.calibration
+            )
+        return events
+
+    def _keep(self) -> None:
+        learned = self.detector.calibration
+        if self._file is None or learned is self._kept:
+            return
+        self._kept, self.not_kept = learned, ""
+        try:
+            learned.save(self._file)
+        except InputError as failure:
+            self.not_kept = str(failure)
 
     def _accept(self, topic: str, source: _Source, block: Waveform) -> list[TrainEvent]:
         odd = _oddity(source.next_ns, block)
@@ -121,8 +155,7 @@ class Intake:
         events: list[TrainEvent] = []
         if source.run > self.restarts:
             self.restarts = source.run
-            events += self.detector.finish()
-            self.detector.reset()
+            events += self._end()
         source.run = self.restarts
         for block in held:
             events += self._process(topic, source, block)
@@ -145,6 +178,7 @@ class Intake:
             self.gaps[topic] += 1
             self.missing_ns[topic] += block.stamp_ns - source.next_ns
         events = self.detector.process(block)
+        self._keep()
         source.next_ns, source.frame = block.end_ns, block.frame_id
         source.run, self._now_ns = self.restarts, block.end_ns
         self.blocks[topic] += 1
@@ -153,6 +187,14 @@ class Intake:
     def _refuse(self, topic: str, kind: str, reason: str) -> None:
         self.refused[f"{topic}: {kind}"] += 1
         self.last_refusal = f"{topic}: {reason}"
+
+
+def _read(file: Path) -> Calibration | None:
+    if file.exists():
+        return Calibration.load(file)
+    if not file.parent.is_dir():
+        raise InputError(f"calibration_file = {file}: there is no directory {file.parent}; make it")
+    return None
 
 
 class _Refusal(Exception):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -25,6 +26,7 @@ class Listening:
         channels: the accelerometers by topic.
         qos: of the subscriptions.
         tell: called with the events that a block completes.
+        calibration: file that keeps what passages teach of the site, or none.
     """
 
     def __init__(
@@ -33,11 +35,12 @@ class Listening:
         channels: dict[str, list[Channel]],
         qos: QoSProfile,
         tell: Callable[[Sequence[TrainEvent]], None],
+        calibration: Path | None = None,
     ) -> None:
         self.channels = channels
         self._node = node
         self._tell = tell
-        self._intake = Intake(channels)
+        self._intake = Intake(channels, calibration)
         self._inputs = [(topic, self._subscribe(topic, qos)) for topic in channels]
 
     def _subscribe(self, topic: str, qos: QoSProfile) -> Any:
@@ -59,6 +62,8 @@ class Listening:
             self._node.destroy_subscription(subscription)
         self._inputs.clear()
         self._tell(self._intake.finish())
+        if self._intake.not_kept:
+            self._node.get_logger().error(self._intake.not_kept)
 
     def _drain(self, topic: str, subscription: Any, deadline: float) -> None:
         with subscription.handle:

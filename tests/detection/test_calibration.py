@@ -13,6 +13,7 @@ from trackvib_ros.detection.kinematics import Motion
 from .synthetic import CATALOGUE, RAILS, Passage, blocks, record
 
 NAMES = ("a", "b")
+CHANNELS = (Channel("a", 0.0), Channel("b", 20.0))
 
 
 def measured(value, sigma=0.03):
@@ -22,7 +23,7 @@ def measured(value, sigma=0.03):
 
 
 def test_first_passage_is_a_weighted_mean():
-    found = Calibration.untaught(NAMES, 0.1).learned(measured(0.12, 0.05))
+    found = Calibration.untaught(CHANNELS, 0.1).learned(measured(0.12, 0.05))
     # weights of N(0, 2 x 0.1²), a little more for a passage's drift, and 0.12 +- 0.05
     prior = 2 * 0.1**2 * (1 + 2 / 300)
     offset, covariance = found.relative(NAMES)
@@ -36,7 +37,7 @@ def test_stated_sigma_holds_while_learning():
     ratios = []
     for _ in range(200):
         true = 2**0.5 * 0.05 * rng.standard_normal()
-        state = Calibration.untaught(NAMES, 0.05)
+        state = Calibration.untaught(CHANNELS, 0.05)
         for _ in range(5):
             state = state.learned(measured(true + 0.03 * rng.standard_normal()))
         offset, covariance = state.relative(NAMES)
@@ -46,12 +47,12 @@ def test_stated_sigma_holds_while_learning():
 
 
 def test_a_contradiction_teaches_nothing():
-    state = Calibration.untaught(NAMES, 0.02)
+    state = Calibration.untaught(CHANNELS, 0.02)
     assert state.learned(measured(0.5)) is state
 
 
 def test_old_passages_fade():
-    state = Calibration.untaught(NAMES, 0.05)
+    state = Calibration.untaught(CHANNELS, 0.05)
     for _ in range(50):
         state = state.learned(measured(0.08))
     assert state.relative(NAMES)[0][1] == pytest.approx(0.08, abs=0.005)
@@ -62,7 +63,7 @@ def test_old_passages_fade():
 
 
 def test_text_and_back():
-    state = Calibration.untaught(NAMES, 0.05).learned(measured(0.04))
+    state = Calibration.untaught(CHANNELS, 0.05).learned(measured(0.04))
     again = Calibration.from_json(state.to_json())
     assert again.to_json() == state.to_json()
     with pytest.raises(InputError, match="offset_m"):
@@ -103,7 +104,7 @@ def test_a_wrong_position_is_learned_and_then_allowed_for():
 
 def test_a_calibration_of_other_channels_is_refused():
     with pytest.raises(InputError, match="calibration is of channels a, b"):
-        TrainDetector(RAILS, calibration=Calibration.untaught(NAMES, 0.02))
+        TrainDetector(RAILS, calibration=Calibration.untaught(CHANNELS, 0.02))
 
 
 def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
@@ -112,13 +113,13 @@ def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
     seen = np.linspace(0.0, 1.0, 9)
     blind = Blind(NAMES, 0.0, motion, (40.0, 0.1), seen, 0 * seen, 0.9, 1, 0.9, True, "delay",
                   baseline=20.0)  # fmt: skip
-    told = at_site(blind, Calibration.untaught(NAMES, 0.5))
+    told = at_site(blind, Calibration.untaught(CHANNELS, 0.5))
     relative = (2 * 0.5**2 - 2 * POSITION_SIGMA**2) ** 0.5 / 20.0
     assert told.speed == pytest.approx((40.0, np.hypot(0.1, 40.0 * relative)), rel=1e-12)
     assert told.motion.speed_sigma(0.0) == pytest.approx(told.speed[1], rel=1e-12)
-    assert at_site(blind, Calibration.untaught(NAMES, POSITION_SIGMA)).speed == blind.speed
+    assert at_site(blind, Calibration.untaught(CHANNELS, POSITION_SIGMA)).speed == blind.speed
     # a metre more, as five passages have taught, makes everything longer and faster
-    state = Calibration.untaught(NAMES, 0.5)
+    state = Calibration.untaught(CHANNELS, 0.5)
     for _ in range(5):
         state = state.learned(measured(1.0))
     offset, covariance = state.relative(NAMES)
@@ -130,7 +131,7 @@ def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
 
 
 def test_bowl_is_learned_as_a_weighted_mean():
-    start = Calibration.untaught(NAMES)
+    start = Calibration.untaught(CHANNELS)
     before, spread = start.wavenumber("a")
     found = start.learned_bowl("a", 2.0, 0.03)
     noise = 0.03**2 + SHAPE_SIGMA**2
@@ -144,7 +145,7 @@ def test_bowl_is_learned_as_a_weighted_mean():
 
 def test_file_and_back(tmp_path):
     path = tmp_path / "site.json"
-    state = Calibration.untaught(NAMES).learned(measured(0.02)).learned_bowl("b", 1.6, 0.02)
+    state = Calibration.untaught(CHANNELS).learned(measured(0.02)).learned_bowl("b", 1.6, 0.02)
     state.save(path)
     state.save(path)
     assert Calibration.load(path).to_json() == state.to_json()
@@ -156,13 +157,13 @@ def test_what_is_no_calibration_is_not_overwritten(tmp_path, text):
     path = tmp_path / "notes.txt"
     path.write_text(text, "latin-1")
     with pytest.raises(InputError, match=r"notes\.txt"):
-        Calibration.untaught(NAMES).save(path)
+        Calibration.untaught(CHANNELS).save(path)
     assert path.read_text("latin-1") == text
 
 
 def test_a_directory_that_does_not_exist_is_named(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
-        Calibration.untaught(NAMES).save(tmp_path / "nowhere" / "site.json")
+        Calibration.untaught(CHANNELS).save(tmp_path / "nowhere" / "site.json")
 
 
 def test_known_trains_teach_the_bowl_and_so_the_speed_of_an_unlisted_one():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -323,3 +324,20 @@ def test_detector_refuses_lists_that_do_not_fit(graph: Graph) -> None:
     node = detector_of(graph, channel_names=["a", "b"], channel_positions=[1.0])
     assert not change(graph, "detector", Transition.TRANSITION_CONFIGURE)
     assert "channel_positions: 1" in str(node.failure)
+
+
+def test_detector_refuses_a_calibration_file_that_is_none(graph: Graph, tmp_path: Path) -> None:
+    file = tmp_path / "site.json"
+    file.write_text("my notes")
+    node = detector_of(
+        graph,
+        channel_names=["a"],
+        channel_positions=[1.0],
+        channel_layers=["rail"],
+        channel_topics=["a/waveform"],
+        calibration_file=str(file),
+    )
+    assert change(graph, "detector", Transition.TRANSITION_CONFIGURE)
+    assert not change(graph, "detector", Transition.TRANSITION_ACTIVATE)
+    assert "site.json is not used or overwritten" in str(node.failure)
+    assert file.read_text() == "my notes"

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from solver import InputError
 
 from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD
+from .events import Channel
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ SCHEMA = "trackvib-calibration-2"
 """Name and version of the text that :meth:`Calibration.to_json` writes."""
 
 _MEMORY = 300.0  # passages after which what was learned has faded to what was stated
+_SAME_PLACE = 1e-6  # m
 _GATE = 4.0  # standard deviations: more is another train than was thought, or a moved sensor
 
 
@@ -49,7 +51,8 @@ class Calibration:
     """Where rail channels are, with what was learned of it.
 
     Attributes:
-        channels: names of the rail channels.
+        channels: names of the channels.
+        positions: of them as stated (m), shape (channels,).
         offset: effective minus stated position (m), shape (channels,); only differences of two
             channels can be observed.
         covariance: of the offsets (m²), shape (channels, channels).
@@ -61,6 +64,7 @@ class Calibration:
     """
 
     channels: tuple[str, ...]
+    positions: Array
     offset: Array
     covariance: Array
     stated: float
@@ -69,11 +73,12 @@ class Calibration:
     bowl_variance: Array
 
     @classmethod
-    def untaught(cls, channels: Sequence[str], stated: float = POSITION_SIGMA) -> Calibration:
+    def untaught(cls, channels: Sequence[Channel], stated: float = POSITION_SIGMA) -> Calibration:
         """The positions as stated, with a standard uncertainty (m)."""
         n = len(channels)
         return cls(
-            channels=tuple(channels),
+            channels=tuple(channel.name for channel in channels),
+            positions=np.array([channel.x for channel in channels]),
             offset=np.zeros(n),
             covariance=stated**2 * np.eye(n),
             stated=stated,
@@ -81,6 +86,26 @@ class Calibration:
             bowl=np.full(n, np.log(WAVENUMBER)),
             bowl_variance=np.full(n, WAVENUMBER_SPREAD**2),
         )
+
+    def check(self, channels: Sequence[Channel]) -> None:
+        """Whether it was learned with these channels.
+
+        Raises:
+            InputError: with others, or they had other positions.
+        """
+        names = [channel.name for channel in channels]
+        if set(self.channels) != set(names):
+            raise InputError(
+                f"calibration is of channels {', '.join(self.channels)}, the detector has "
+                f"{', '.join(names)}; give one that was learned with these"
+            )
+        for channel in channels:
+            learned = float(self.positions[self.channels.index(channel.name)])
+            if abs(learned - channel.x) > _SAME_PLACE:
+                raise InputError(
+                    f"calibration was learned with {channel.name} at x = {learned} m, the detector "
+                    f"has it at {channel.x} m; learn anew, or give the position as it was"
+                )
 
     def wavenumber(self, name: str) -> tuple[float, float]:
         """Wavenumber of the deflection at a channel (rad/m), and its relative sigma."""
@@ -171,6 +196,7 @@ class Calibration:
             {
                 "schema": SCHEMA,
                 "channels": self.channels,
+                "positions_m": self.positions.tolist(),
                 "offset_m": self.offset.tolist(),
                 "covariance_m2": self.covariance.tolist(),
                 "stated_m": self.stated,
@@ -195,6 +221,7 @@ class Calibration:
                     f"calibration: schema is {schema!r}, this version reads {SCHEMA!r}"
                 )
             names = tuple(str(name) for name in table["channels"])
+            positions = np.array(table["positions_m"], dtype=np.float64)
             offset = np.array(table["offset_m"], dtype=np.float64)
             covariance = np.array(table["covariance_m2"], dtype=np.float64)
             bowl = np.array(table["ln_bowl_wavenumber"], dtype=np.float64)
@@ -203,6 +230,8 @@ class Calibration:
         except (ValueError, KeyError, TypeError) as failure:
             raise InputError(f"calibration: {failure}; give what to_json wrote") from None
         n = len(names)
+        if positions.shape != (n,) or not np.isfinite(positions).all():
+            raise InputError(f"calibration: positions_m must be {n} finite numbers (m)")
         if offset.shape != (n,) or covariance.shape != (n, n):
             raise InputError(
                 f"calibration: offset_m {offset.shape} and covariance_m2 {covariance.shape} must "
@@ -219,4 +248,4 @@ class Calibration:
             raise InputError("calibration: covariance_m2 must be finite and not negative (m²)")
         if not (np.isfinite(bowl).all() and np.isfinite(variance).all() and np.all(variance > 0)):
             raise InputError("calibration: ln_bowl_variance must be finite and positive (-)")
-        return cls(names, offset, covariance, stated, passages, bowl, variance)
+        return cls(names, positions, offset, covariance, stated, passages, bowl, variance)

@@ -149,12 +149,9 @@ class TrainDetector:
             raise InputError("the detector has no channel; give at least one Channel")
         if len(set(names)) != len(names):
             raise InputError(f"channel names must differ, not {', '.join(names)}")
-        if calibration is not None and set(calibration.channels) != set(names):
-            raise InputError(
-                f"calibration is of channels {', '.join(calibration.channels)}, the detector has "
-                f"{', '.join(names)}; give one that was learned with these"
-            )
-        self._given = calibration or Calibration.untaught(names, self.config.position_sigma)
+        if calibration is not None:
+            calibration.check(self.channels)
+        self._given = calibration or Calibration.untaught(self.channels, self.config.position_sigma)
         self._index = {name: i for i, name in enumerate(names)}
         self._limits = (self.config.min_speed, self.config.max_speed)
         self.reset()

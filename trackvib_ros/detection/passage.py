@@ -659,7 +659,7 @@ def find_passages(
 
     Without ``unlisted`` none that no type explains, quicker.
     """
-    site = site or Calibration.untaught([r.channel.name for r in records])
+    site = site or Calibration.untaught([r.channel for r in records])
     rails = [r for r in records if r.channel.layer == "rail" and excited(r, within)]
     if not rails:
         return []
