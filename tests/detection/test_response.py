@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, Estimate, TrainEvent, detect
-from trackvib_ros.detection.response import Model, Observation, Spectrum, comb
+from trackvib_ros.detection.response_model import Model, Observation, Spectrum, comb
 from trackvib_ros.detection.unlisted import CAR, EqualCars
 from trackvib_ros.nuisances import RATE, nuisance
 

@@ -1,0 +1,262 @@
+"""The model of a channel that answers every wheelset alike: its spectra, its evidence.
+
+What is slower than the passing train is left out: a hump in time is not the pattern of a train.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from .features import SLOW
+from .record import Record
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+USUAL_MISFIT = 0.25
+"""Part of the spectrum that no response explains, where it is not fitted."""
+
+_MARGIN_S = 1.5  # on either side of the strong energy
+_FADE_S = 0.3
+_SLOWEST = 4.0  # periods in the strong interval: what is slower is its envelope
+_SMOOTH_HZ = 2.0
+_TOP_HZ = 80.0  # the waveform is low-passed at 100 Hz
+
+
+def smoothed(values: Array, width: int) -> Array:
+    """Mean over ``width`` neighbours, mirrored at the ends."""
+    half = min(width // 2, values.size - 1)
+    total = np.concatenate([[0.0], np.cumsum(np.pad(values, half, mode="reflect"))])
+    return np.asarray((total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One series of a channel about the middle of its strong energy, fading to zero at the ends.
+
+    Attributes:
+        time: of the samples after ``epoch`` (s), equal steps.
+        quiet: samples before the event.
+        duration: between 5 and 95 % of the energy (s).
+        limit: highest frequency it holds (Hz).
+    """
+
+    name: str
+    epoch: float
+    time: Array
+    values: Array
+    quiet: Array
+    duration: float
+    limit: float
+
+
+class Spectrum:
+    """Fourier coefficients of an observation between the slowest wave and ``top`` (Hz).
+
+    Args:
+        room: longest response (s); the series is periodic and must not wrap around.
+    """
+
+    def __init__(self, seen: Observation, room: float, top: float) -> None:
+        self.epoch = seen.epoch
+        n, step = seen.values.size, float(seen.time[1] - seen.time[0])
+        size = int(fft.next_fast_len(n + int(room / step), real=True))
+        f = fft.rfftfreq(size, step)
+        wanted = (f >= _SLOWEST / seen.duration) & (f <= min(top, seen.limit))
+        self.f: Array = f[wanted]
+        self.y: ComplexArray = fft.rfft(seen.values, size)[wanted] * np.exp(
+            -2j * np.pi * self.f * seen.time[0]
+        )
+        self.share = n / size  # of the coefficients that are independent
+        quiet = seen.quiet
+        self.noise = np.zeros(self.f.size)
+        if quiet.size > 64:
+            own = np.abs(fft.rfft(quiet)) ** 2 * (n / quiet.size)
+            own = smoothed(own, max(3, round(_SMOOTH_HZ * quiet.size * step)))
+            self.noise = np.interp(self.f, fft.rfftfreq(quiet.size, step), own)
+        self.excess = np.zeros(self.f.size)
+        if self.usable:
+            power = np.abs(self.y) ** 2
+            power = smoothed(power, min(round(_SMOOTH_HZ * size * step), self.f.size // 3))
+            self.excess = np.maximum(power - self.noise, 1e-3 * power + 1e-12 * power.max())
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is something to compare."""
+        return self.f.size >= 8 and bool(np.any(self.y))
+
+
+def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexArray:
+    """Fourier transform of the wheelset times about that of the middle of the train.
+
+    Args:
+        places: of the wheelsets behind the middle (m).
+        f: frequencies (Hz), equal steps.
+        speed, acceleration: as the middle passes (m/s, m/s²), shape (motions,).
+
+    Returns:
+        Shape (motions, frequencies).
+    """
+    v, a = speed[:, None], acceleration[:, None]
+    root = np.sqrt(np.maximum(v * v + 2 * a * places, 0.01 * v * v))
+    times = 2 * places / (v + root)
+    if not f.size:
+        return np.zeros((speed.size, 0), dtype=np.complex128)
+    # frequency i + block j is a product of two phases: far fewer exponentials, and a matrix product
+    block = max(1, round(float(np.sqrt(f.size))))
+    blocks = -(-f.size // block)
+    step = (f[-1] - f[0]) / max(f.size - 1, 1)
+    inner = np.exp(-2j * np.pi * times[:, None, :] * (step * np.arange(block))[:, None])
+    outer = np.exp(
+        -2j * np.pi * times[:, None, :] * (f[0] + step * block * np.arange(blocks))[:, None]
+    )
+    return np.asarray((outer @ inner.swapaxes(1, 2)).reshape(speed.size, -1)[:, : f.size])
+
+
+@dataclass(frozen=True)
+class Model:
+    """A spectrum with the support of its response and the part that this cannot explain.
+
+    Attributes:
+        before, after: support of the response about the passing of its wheelset (s).
+        centre: of that passing for the middle of the train, after the epoch (s).
+    """
+
+    spectrum: Spectrum
+    before: float
+    after: float
+    misfit: float = USUAL_MISFIT
+    centre: float = 0.0
+
+    @property
+    def knots(self) -> Array:
+        """Times at which the response is free (s)."""
+        step = 1 / (2.3 * self.spectrum.f[-1])
+        return np.arange(-self.before, self.after + step, step)
+
+    def _variance(self) -> Array:
+        return self.spectrum.noise + self.misfit * self.spectrum.excess
+
+    def _shape(self, wheelsets: int, knots: int) -> Array:
+        return np.sqrt(self.spectrum.excess / (wheelsets * knots))
+
+    def _normal(self, combs: ComplexArray, wheelsets: int, centres: Array) -> tuple[Array, Array]:
+        s, t = self.spectrum, self.knots
+        shape = self._shape(wheelsets, t.size)
+        weight = 2 * s.share / self._variance()
+        lags = np.cos(2 * np.pi * np.outer(s.f, t - t[0]))
+        column = (np.abs(combs) ** 2 * (weight * shape**2)) @ lags
+        knots = np.exp(2j * np.pi * np.outer(s.f, t))
+        phase = knots[:, :, None] * np.exp(2j * np.pi * np.outer(s.f, centres))[:, None, :]
+        right = np.real((np.conj(combs) * (weight * shape * s.y)) @ phase.reshape(s.f.size, -1))
+        order = np.abs(np.subtract.outer(np.arange(t.size), np.arange(t.size)))
+        return column[:, order] + np.eye(t.size), right.reshape(len(combs), t.size, centres.size)
+
+    def evidence(self, combs: ComplexArray, wheelsets: int, centres: Array) -> Array:
+        """ln of the marginal likelihood over that of a disturbance with the same spectrum.
+
+        The response has a Gaussian prior with the spectrum of what is observed.
+
+        Args:
+            combs: :func:`comb` of every motion, shape (motions, frequencies).
+            wheelsets: their number.
+            centres: trial values of :attr:`centre`, shape (centres,).
+
+        Returns:
+            Shape (motions, centres).
+        """
+        s = self.spectrum
+        normal, right = self._normal(combs, wheelsets, centres)
+        factor = np.linalg.cholesky(normal)
+        part = np.linalg.solve(factor, right)
+        explained = np.sum(part * part, axis=1)
+        cost = 2 * np.sum(np.log(np.diagonal(factor, axis1=1, axis2=2)), axis=1)
+        own, rest = s.noise + s.excess, self._variance()
+        power = np.abs(s.y) ** 2
+        gain = s.share * float(np.sum(np.log(own / rest) + power / own - power / rest))
+        return np.asarray(gain + 0.5 * explained - 0.5 * cost[:, None])
+
+    def response(self, places: Array, speed: float, acceleration: float) -> ComplexArray:
+        """Fourier transform of the most probable response, about the middle of the train."""
+        s, t = self.spectrum, self.knots
+        combs = comb(places, s.f, np.array([speed]), np.array([acceleration]))
+        normal, right = self._normal(combs, places.size, np.array([self.centre]))
+        knots = np.linalg.solve(normal[0], right[0, :, 0])
+        series = np.exp(-2j * np.pi * np.outer(s.f, t + self.centre)) @ knots
+        return np.asarray(self._shape(places.size, t.size) * series)
+
+    def shares(
+        self, groups: Sequence[Array], places: Array, speed: float, acceleration: float
+    ) -> tuple[Array, Array]:
+        """Normal matrix and right side for an amplitude per group of wheelsets.
+
+        All groups have the response that is common to the train.
+        """
+        s, v, a = self.spectrum, np.array([speed]), np.array([acceleration])
+        common = self.response(places, speed, acceleration)
+        parts = np.concatenate([comb(group, s.f, v, a) for group in groups]) * common
+        weighted = np.conj(parts) * (2 * s.share / self._variance())
+        return np.real(weighted @ parts.T), np.real(weighted @ s.y)
+
+
+def strong_extent(record: Record, within: tuple[float, float]) -> tuple[float, float] | None:
+    """Times (s) of 5 and 95 % of the energy above the floor, in the band where they are closest.
+
+    What rings on lengthens it, in some bands more than in others. The load itself, slower than 5
+    Hz, counts where nothing else shows.
+    """
+    window = record.window
+    found: list[tuple[float, float, float]] = []
+    for b in sorted(range(len(window.bands)), key=lambda b: window.bands[b] == SLOW):
+        if window.bands[b] == SLOW and found:
+            break
+        time = window.time - window.shift[b]
+        inside = (time > within[0]) & (time < within[1]) & window.valid
+        energy = np.maximum(window.energy[inside, b] - record.floor[b], 0)
+        total = np.cumsum(energy)
+        if not inside.any() or total[-1] <= 0:
+            continue
+        start, stop = np.interp((0.05, 0.95), total / total[-1], time[inside])
+        found.append((float(stop - start), float(start), float(stop)))
+    return min(found)[1:] if found else None
+
+
+def observations(
+    record: Record, within: tuple[float, float], extent: tuple[float, float]
+) -> list[Observation]:
+    """The low-passed waveform and the energy of every band, in this order."""
+    window = record.window
+    step = window.step
+    series = [("waveform", window.time - window.low_shift, window.low, _TOP_HZ)]
+    for b, band in enumerate(window.bands):
+        name = f"energy {band[0]:g}-{band[1]:g} Hz"
+        series.append((name, window.time - window.shift[b], window.energy[:, b], 0.3 * band[1]))
+    epoch = 0.5 * (extent[0] + extent[1])
+    out = []
+    for name, time, raw, limit in series:
+        values = raw
+        if not window.valid.all() and window.valid.any():
+            values = np.interp(time, time[window.valid], raw[window.valid])
+        near = (time > extent[0] - _MARGIN_S) & (time < extent[1] + _MARGIN_S)
+        values, time = values.copy(), time - epoch
+        quiet = values[window.time < within[0]]
+        part = values[near]
+        ends = max(4, round(0.1 / step))
+        if part.size < 8 * ends:
+            continue
+        first, last = np.median(part[:ends]), np.median(part[-ends:])
+        part = part - np.linspace(first, last, part.size)
+        fade = min(round(_FADE_S / step), part.size // 8)
+        ramp = 0.5 - 0.5 * np.cos(np.pi * (np.arange(fade) + 0.5) / fade)
+        part[:fade] *= ramp
+        part[-fade:] *= ramp[::-1]
+        grid = time[near][0] + step * np.arange(part.size)
+        quiet = quiet - quiet.mean() if quiet.size else quiet
+        duration = extent[1] - extent[0]
+        out.append(Observation(name, epoch, grid, part, quiet, duration, min(limit, 0.4 / step)))
+    return out

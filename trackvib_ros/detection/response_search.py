@@ -1,0 +1,379 @@
+"""The motions and types that explain all observations best, from a coarse grid on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .catalogue import TrainType
+from .kinematics import PRIOR_ACCELERATION
+from .response_model import (
+    Model,
+    Observation,
+    Spectrum,
+    comb,
+)
+from .unlisted import CAR, EqualCars, starts
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+CORRELATED = 2.5
+"""Misfit is not white: its neighbouring coefficients go together, so that this many count as one.
+Mean square of error over sigma of the speed on computed passages when counted as independent."""
+
+COARSE = 8.0
+"""Shortest waves that are compared at first (m)."""
+
+PASSED, PASSED_SPREAD = 0.95, 0.15
+"""Part of the time between first and last wheelset in which 5 to 95 % of the energy come; its
+relative spread."""
+
+KEPT = 15.0
+"""Evidence below the best at which a hypothesis is dropped."""
+
+_MISFITS = 0.5, 0.25, 0.12, 0.06, 0.03, 0.015  # parts of the spectrum that no response explains
+_REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
+_MIDDLE, _FINE = 4.0, 2.0  # m, shortest waves that are compared, later
+_RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
+_DECELERATION = 0.4  # of the speed, largest change over a passage
+_LARGEST = 1.0  # m/s²
+_NEIGHBOUR = 0.3  # cycles at the ends of a train between trial motions
+_PART = 6  # wheelsets, at least, whose amplitude is measured by itself
+_SHRUNK, _WEAKEST, _HEAVIEST = 1.5, 0.65, 2.5
+_BLUR = 0.4  # of the evidence, what a coarse grid and an unknown misfit may cost
+_CLEAR = 20.0  # evidence of a motion without acceleration
+_MOST = 10  # hypotheses that are followed
+_PEAKS = 5  # of a type and orientation
+_CARS = (30.0, 13.5)  # m, longest and shortest cars, at the lowest and the highest speed
+_HALF = 0.12  # ln of speed, half the range of a train of equal cars: half of one car of four
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """One type in one orientation, fitted to all observations.
+
+    Attributes:
+        models: one per observation.
+        motion: its distance is that of the first wheelset past the reference channel.
+        evidence: ln of the marginal likelihood over that of a disturbance.
+    """
+
+    train: TrainType
+    reverse: bool
+    speed: float
+    acceleration: float
+    evidence: float
+    models: tuple[Model, ...] = ()
+    covariance: Array | None = None
+
+    @property
+    def places(self) -> Array:
+        """Distance of every wheelset behind the middle of the train (m)."""
+        return self.train.oriented(self.reverse) - 0.5 * self.train.span
+
+    @property
+    def amplitudes(self) -> Array:
+        """How strongly the parts of the train answer, 1 for the common response, front first."""
+        places = self.places
+        parts = int(np.clip(places.size // _PART, 3, 8))
+        groups = np.array_split(places, parts)
+        normal, right = np.zeros((parts, parts)), np.zeros(parts)
+        for model in self.models:
+            own, wanted = model.shares(groups, places, self.speed, self.acceleration)
+            normal, right = normal + own, right + wanted
+        normal[np.diag_indices(parts)] += 1e-9 * np.trace(normal)
+        return np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+
+    @property
+    def alike(self) -> bool:
+        """Whether all parts of the train answer alike, but for a heavier vehicle.
+
+        A few blows that happen to lie like some wheelsets do not.
+        """
+        size = self.amplitudes
+        usual = float(np.median(size))
+        return bool(
+            usual < _SHRUNK and size.min() > _WEAKEST * usual and size.max() < _HEAVIEST * usual
+        )
+
+
+class Search:
+    """Trial motions against some observations of one passage."""
+
+    def __init__(self, seen: Sequence[Observation], limits: tuple[float, float]) -> None:
+        self.seen = list(seen)
+        self.limits = limits
+        self.epoch = self.seen[0].epoch
+        self.duration = min(s.duration for s in self.seen)
+
+    def models(self, speed: float, wave: float, reach: float, ring: float) -> list[Model]:
+        """Models for waves from ``wave`` (m) at about a speed, with one support."""
+        room = 2 * reach / speed + ring
+        return [
+            Model(Spectrum(s, room, speed / wave), reach / speed, reach / speed + ring)
+            for s in self.seen
+        ]
+
+    def combs(self, k: int, model: Model, places: Array, v: Array, a: Array) -> ComplexArray:
+        """Of trial motions, stated at the common epoch, for observation ``k``."""
+        return comb(places, model.spectrum.f, v + a * (self.seen[k].epoch - self.epoch), a)
+
+    def coarse(
+        self,
+        train: TrainType,
+        reverse: bool,
+        bent: bool = True,
+        spread: tuple[float, float] = _RANGE,
+    ) -> list[ResponseFit]:
+        """The best motions of a type on waves from :data:`COARSE`."""
+        expected = PASSED * train.span / self.duration
+        speeds = expected * np.exp(np.arange(*spread, _NEIGHBOUR * COARSE / train.span))
+        speeds = speeds[(speeds >= self.limits[0]) & (speeds <= self.limits[1])]
+        if not speeds.size:
+            return []
+        bend = 4 * COARSE / self.duration**2
+        most = min(_LARGEST, _DECELERATION * expected / self.duration) if bent else 0.0
+        bends = np.clip(
+            np.arange(-np.ceil(most / bend), np.ceil(most / bend) + 1) * bend, -most, most
+        )
+        places = train.oriented(reverse) - 0.5 * train.span
+        models = self.models(expected, COARSE, _REACHES[0], _RINGS[0])
+        if not all(model.spectrum.usable for model in models):
+            return []
+        spacing = max(0.5 * _REACHES[0] / expected, 0.02)
+        far = np.ceil(0.15 * self.duration / spacing)
+        centres = np.arange(-far, far + 1) * spacing
+        prior = -0.5 * (np.log(speeds / expected) / PASSED_SPREAD) ** 2
+        found = []
+        for a in bends:
+            each = [
+                m.evidence(
+                    self.combs(k, m, places, speeds, np.full(speeds.size, a)), places.size, centres
+                )
+                for k, m in enumerate(models)
+            ]
+            total = prior - 0.5 * (a / PRIOR_ACCELERATION) ** 2
+            total = total + sum(e.max(axis=1) for e in each)
+            before, after = np.r_[-np.inf, total[:-1]], np.r_[total[1:], -np.inf]
+            for i in np.flatnonzero((total >= before) & (total >= after)):
+                placed = tuple(
+                    replace(m, centre=float(centres[np.argmax(e[i])]))
+                    for m, e in zip(models, each, strict=True)
+                )
+                v, score = float(speeds[i]), float(total[i])
+                found.append(ResponseFit(train, reverse, v, float(a), score, placed))
+        found.sort(key=lambda fit: -fit.evidence)
+        apart: list[ResponseFit] = []
+        for fit in found:
+            near = 2 * _NEIGHBOUR * COARSE / train.span
+            if all(abs(fit.speed / other.speed - 1) > near for other in apart):
+                apart.append(fit)
+        return apart[:_PEAKS]
+
+    def scan(self, oriented: Sequence[tuple[TrainType, bool]]) -> list[ResponseFit]:
+        """:meth:`coarse` of all types; accelerations only of the likely ones, if any is."""
+        fits = [fit for t, r in oriented for fit in self.coarse(t, r, bent=False)]
+        top = max((fit.evidence for fit in fits), default=0.0)
+        near = {
+            (fit.train.name, fit.reverse)
+            for fit in fits
+            if top < _CLEAR or fit.evidence > (1 - _BLUR) * top - KEPT
+        }
+        return [f for t, r in oriented if (t.name, r) in near for f in self.coarse(t, r)]
+
+    def total(self, fit: ResponseFit, v: Array, a: Array) -> Array:
+        """Evidence and prior of motions near a fit, shape (motions,)."""
+        places = fit.places
+        expected = PASSED * fit.train.span / self.duration
+        out = -0.5 * (a / PRIOR_ACCELERATION) ** 2
+        out = out - 0.5 * (np.log(v / expected) / PASSED_SPREAD) ** 2
+        for k, m in enumerate(fit.models):
+            combs = self.combs(k, m, places, v, a)
+            out = out + m.evidence(combs, places.size, np.array([m.centre]))[:, 0]
+        return out
+
+    def climb(self, fit: ResponseFit, wave: float, steps: int) -> ResponseFit:
+        """Newton steps to the top of a quadratic through nine motions about the last one."""
+        dv = 0.12 * wave / fit.train.span
+        grid = np.array([(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0)])
+        x, y = grid.T
+        design = np.stack([np.ones(9), x, y, 0.5 * x * x, x * y, 0.5 * y * y], axis=1)
+        v, a = fit.speed, fit.acceleration
+        value, covariance = fit.evidence, None
+        for _ in range(steps):
+            scale = np.array([dv * v, min(wave * (v / fit.train.span) ** 2, 0.3)])
+            values = self.total(fit, v + scale[0] * x, a + scale[1] * y)
+            c = np.linalg.lstsq(design, values, rcond=None)[0]
+            bend = -np.array([[c[3], c[4]], [c[4], c[5]]])
+            if np.linalg.eigvalsh(bend)[0] > 0:
+                move = np.linalg.solve(bend, c[1:3])
+                move *= min(1.0, 1.5 / max(float(np.abs(move).max()), 1e-12))
+                covariance = np.linalg.inv(bend) * np.outer(scale, scale)
+            else:
+                move, covariance = grid[int(np.argmax(values))], None
+            v, a = v + scale[0] * move[0], a + scale[1] * move[1]
+            value = float(c[0] + c[1:3] @ move - 0.5 * move @ bend @ move)
+        v, a = float(v), float(a)
+        return replace(fit, speed=v, acceleration=a, evidence=value, covariance=covariance)
+
+    def adapted(self, fit: ResponseFit, wave: float, reference: float) -> ResponseFit:
+        """The fit with models for finer waves, of the support and misfit with most evidence."""
+        models = []
+        for k, old in enumerate(fit.models):
+            seen, reach = self.seen[k], old.before * reference
+            best: tuple[float, Model] | None = None
+            first = wave == _MIDDLE
+            for r in _REACHES if first else (reach,):
+                for ring in _RINGS if first else (old.after - old.before,):
+                    spectrum = Spectrum(seen, 2 * r / reference + ring, reference / wave)
+                    if not spectrum.usable:
+                        continue
+                    model = Model(spectrum, r / reference, r / reference + ring, old.misfit)
+                    free = max(reach - r, 0.0) / reference
+                    centres = old.centre + np.linspace(-free, free, 5 if free else 1)
+                    combs = self._own(k, model, fit)
+                    values = model.evidence(combs, fit.places.size, centres)[0]
+                    i = int(np.argmax(values))
+                    if best is None or values[i] > best[0]:
+                        best = float(values[i]), replace(model, centre=float(centres[i]))
+            # too few coefficients on finer waves: the coarser ones stay
+            models.append(old if best is None else best[1])
+        return self.weighted(replace(fit, models=tuple(models)))
+
+    def beside(self, fit: ResponseFit, wave: float) -> ResponseFit:
+        """The fit at the best of its neighbouring maxima, its variance that of all of them."""
+        v: Array = fit.speed * (1 + 0.12 * wave / fit.train.span * np.arange(-8.0, 9.0))
+        values = self.total(fit, v, np.full(v.size, fit.acceleration))
+        weight = np.exp((values - values.max()) / CORRELATED)
+        mean = float(weight @ v / weight.sum())
+        variance = float(weight @ (v - mean) ** 2 / weight.sum()) / CORRELATED
+        covariance = fit.covariance
+        if covariance is not None:
+            covariance = covariance + np.diag([max(variance - covariance[0, 0], 0.0), 0.0])
+        best = int(np.argmax(values))
+        return replace(
+            fit, speed=float(v[best]), evidence=float(values[best]), covariance=covariance
+        )
+
+    def weighted(self, fit: ResponseFit) -> ResponseFit:
+        """The fit with the misfits of most evidence."""
+        models = []
+        for k, model in enumerate(fit.models):
+            combs, centre = self._own(k, model, fit), np.array([model.centre])
+            trials = [replace(model, misfit=misfit) for misfit in _MISFITS]
+            values = [m.evidence(combs, fit.places.size, centre)[0, 0] for m in trials]
+            models.append(trials[int(np.argmax(values))])
+        return replace(fit, models=tuple(models))
+
+    def shared(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        """Every fit with the models of whichever fit suit it best, most probable first.
+
+        What one of two like trains has found of a response, the other one must be allowed, too:
+        types must not be told apart by how well a search went.
+        """
+        out = []
+        for fit in fits:
+            models = []
+            for k, own in enumerate(fit.models):
+                trials = {(m.before, m.after, m.misfit): m for m in (f.models[k] for f in fits)}
+                starts = [own.centre, *(m.centre for m in trials.values())]
+                centres = np.unique(np.round(starts, 4))
+                best = -np.inf, own
+                for trial in trials.values():
+                    values = trial.evidence(self._own(k, trial, fit), fit.places.size, centres)[0]
+                    i = int(np.argmax(values))
+                    if values[i] > best[0]:
+                        best = float(values[i]), replace(trial, centre=float(centres[i]))
+                models.append(best[1])
+            moved = self.climb(replace(fit, models=tuple(models)), _FINE, 2)
+            told = self.beside(moved, _FINE)
+            out.append(
+                moved if told.covariance is None else replace(moved, covariance=told.covariance)
+            )
+        return sorted(out, key=lambda fit: -fit.evidence)
+
+    def transferred(
+        self, oriented: Sequence[tuple[TrainType, bool]], fits: Sequence[ResponseFit]
+    ) -> list[ResponseFit]:
+        """Every type in the passing time, and with the models, of the fit that suits it best."""
+        found = []
+        for train, reverse in oriented:
+            best: ResponseFit | None = None
+            for fit in fits:
+                ratio = train.span / fit.train.span
+                near = 1 + 0.12 * _FINE / train.span * np.arange(-4.0, 5.0, 2.0)
+                v, a = ratio * fit.speed * near, np.full(near.size, ratio * fit.acceleration)
+                if not self.limits[0] <= ratio * fit.speed <= self.limits[1]:
+                    continue
+                trial = replace(fit, train=train, reverse=reverse)
+                values = self.total(trial, v, a)
+                i = int(np.argmax(values))
+                if best is None or values[i] > best.evidence:
+                    v_best, a_best, value = float(v[i]), float(a[i]), float(values[i])
+                    best = replace(trial, speed=v_best, acceleration=a_best, evidence=value)
+            if best is not None:
+                found.append(best)
+        found.sort(key=lambda fit: -fit.evidence)
+        return found[:_PEAKS]
+
+    def unlisted(self) -> ResponseFit | None:
+        """The train of equal cars that explains most; its speed is that of cars of 20 m."""
+        sizes = [limit * CAR[0] / length for limit, length in zip(self.limits, _CARS, strict=True)]
+        search = Search(self.seen, (sizes[0], sizes[1]))
+        found = []
+        for cars in starts():
+            near = search.coarse(cars.train, False, bent=False, spread=(-_HALF, _HALF))
+            found += [(fit, cars) for fit in near[:1]]
+        if not found:
+            return None
+        fit, cars = max(found, key=lambda pair: pair[0].evidence)
+        fit = search.refined(search.coarse(cars.train, False, spread=(-_HALF, _HALF))[:2] or [fit])[
+            0
+        ]
+        for trials in (EqualCars.numbers, EqualCars.proportions, EqualCars.numbers):
+            v = fit.speed * (1 + 0.06 * _FINE / fit.train.span * np.arange(-2.0, 3.0, 2.0))
+            a = np.full(v.size, fit.acceleration)
+            values = []
+            for trial in trials(cars):
+                values.append(float(search.total(replace(fit, train=trial.train), v, a).max()))
+            cars = trials(cars)[int(np.argmax(values))]
+            fit = replace(fit, train=cars.train)
+        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2)
+
+    def _own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
+        v, a = np.array([fit.speed]), np.array([fit.acceleration])
+        return self.combs(k, model, fit.places, v, a)
+
+    def refined(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        """The likely ones of coarse fits on finer and finer waves, most probable first."""
+        for wave in (_MIDDLE, _FINE):
+            best = max(fits, key=lambda fit: fit.evidence)
+            kept = KEPT + (_BLUR * abs(best.evidence) if wave == _MIDDLE else 0.0)
+            near = [fit for fit in fits if fit.evidence > best.evidence - kept]
+            leaders = {id(fit): fit for fit in sorted(near, key=lambda fit: fit.evidence)}
+            first = {fit.train.name: id(fit) for fit in leaders.values()}
+            near.sort(key=lambda fit: (first[fit.train.name] != id(fit), -fit.evidence))
+            fits = []
+            for fit in near[:_MOST]:
+                moved = self.beside(self.adapted(fit, wave, best.speed), wave)
+                moved = self.climb(self.weighted(self.climb(moved, wave, 2)), wave, 2)
+                told = self.beside(moved, wave)
+                fits.append(
+                    moved if told.covariance is None else replace(moved, covariance=told.covariance)
+                )
+        return sorted(fits, key=lambda fit: -fit.evidence)
+
+
+def distinct(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+    """Fits without those that a better one of the same type repeats."""
+    kept: list[ResponseFit] = []
+    for fit in fits:
+        alike = [f for f in kept if f.train is fit.train and f.reverse == fit.reverse]
+        near = 2 * _NEIGHBOUR * COARSE / fit.train.span
+        if all(abs(f.speed / fit.speed - 1) > near for f in alike):
+            kept.append(fit)
+    return kept
