@@ -81,3 +81,8 @@ def test_from_arrays():
 def test_longest_gap_of_wheelsets():
     own = Catalogue.from_axles({"short": [0.0, 2.5, 9.0, 11.5], "wagons": [0.0, 12.25, 13.0]})
     assert own.longest_gap == 12.25
+
+
+def test_axles_without_a_name_are_refused():
+    with pytest.raises(InputError, match="mapping of names to axle positions"):
+        Catalogue.from_axles([0.0, 2.5, 17.4, 19.9])

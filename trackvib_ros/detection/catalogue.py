@@ -170,7 +170,16 @@ class Catalogue:
     def from_axles(
         cls, trains: Mapping[str, Sequence[float]], version: str = "caller"
     ) -> Catalogue:
-        """Catalogue of bare axle positions (m) by name; the first wheelset need not be at 0."""
+        """Catalogue of bare axle positions (m) by name; the first wheelset need not be at 0.
+
+        Raises:
+            InputError: no mapping of names, or positions that are not two or more numbers.
+        """
+        if not isinstance(trains, Mapping):
+            raise InputError(
+                f"trains = {trains!r} must be a mapping of names to axle positions (m), "
+                'like {"my train": [0.0, 2.5, 17.4, 19.9]}'
+            )
         types = []
         for name, positions in trains.items():
             try:
