@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from . import travel
 from .bowl import WAVENUMBER, WAVENUMBER_SPREAD
 from .calibration import POSITION_SIGMA, Calibration
 from .kinematics import Motion
-from .pattern import Trace
 from .place import Wave, likelihood, locate
 from .record import Record
 from .single import HUMP, HUMP_FINE, alone, log_energy
@@ -25,7 +23,6 @@ Array = NDArray[np.float64]
 CONFIDENT = 0.8
 """Least probability of a number of wheelsets that is told without reserve."""
 
-_GRID_S = 0.002
 
 _PULSE_CELLS = 60  # of :data:`travel.CELL`
 _BEAM = 1.2  # 1/m, sqrt^4(k/4EI) of a rail on fastenings of 40 to 100 kN/mm every 0.65 m
@@ -83,43 +80,6 @@ class Blind:
     def spacings(self) -> Array:
         """Distances between successive wheelsets (m)."""
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
-
-
-def envelope_delay(
-    a: Trace, b: Trace, within: tuple[float, float], limits: tuple[float, float]
-) -> tuple[float, float] | None:
-    """Delay of channel b behind a (s) by correlation of log-energies, and the correlation.
-
-    Only delays of a train between the speed limits (m/s) are looked at. ``None`` if the channels
-    are too near each other.
-    """
-    baseline = abs(b.x - a.x)
-    shortest, longest = baseline / limits[1], baseline / limits[0]
-    if shortest < 4 * _GRID_S:
-        return None
-    time = np.arange(within[0] - longest, within[1] + longest, _GRID_S)
-    if time.size < 20:
-        return None
-    levels = []
-    for trace in (a, b):
-        level = trace.level(time - 0.004, time + 0.004)
-        width = max(3, int(0.4 / _GRID_S))
-        background = np.convolve(level, np.ones(width) / width, mode="same")
-        levels.append(level - background)
-    norm = np.sqrt(np.sum(levels[0] ** 2) * np.sum(levels[1] ** 2))
-    if norm <= 0:
-        return None
-    correlation = signal.correlate(levels[1], levels[0], mode="full", method="fft") / norm
-    lag = (np.arange(correlation.size) - (time.size - 1)) * _GRID_S
-    allowed = (np.abs(lag) >= shortest) & (np.abs(lag) <= longest)
-    correlation = np.where(allowed, correlation, -1.0)
-    k = int(np.argmax(correlation))
-    if not 0 < k < correlation.size - 1:
-        return None
-    left, here, right = correlation[k - 1 : k + 2]
-    bend = left - 2 * here + right
-    fraction = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return float(lag[k] + np.clip(fraction, -1, 1) * _GRID_S), float(here)
 
 
 def describe(

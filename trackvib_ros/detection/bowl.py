@@ -46,7 +46,6 @@ _SHIFT = 0.2  # m, standard deviation of the pulses' common place
 _STARTS = (-0.2, 0.05, 0.3)
 _STEPS = np.array([0.02, 0.15, 0.3])
 _LEAST_LEFT = 1e-9
-_SEARCH = {"xatol": 4e-3, "fatol": 0.02, "maxfev": 70}
 _MOST_STEP = 0.3  # rad of the corner, 0.17 m
 
 
