@@ -17,9 +17,11 @@ from .events import Channel, Estimate, TrainEvent, Value
 from .head import HeadMatcher
 from .health import HealthBook, clipped
 from .live import departed
-from .passage import Passage, bowl_of, excited, find_passages
+from .passage import Passage
+from .passage_search import bowl_of, find_passages
 from .record import Record
 from .response import find_response
+from .strength import excited
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from .delay import find_delay
 from .head import MOST_UNCERTAIN, Head, HeadMatcher
-from .passage import excited, strong_interval
 from .pattern import Trace
 from .record import Record
+from .strength import excited, strong_interval
 
 AXLE_SPACING = 6.2
 """Track per wheelset of a train on bogies (m), to count how many have passed."""

@@ -1,0 +1,212 @@
+"""The types that channels show, fitted to their waveforms and weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .axles import fit_axles, refit
+from .calibration import Calibration, Measured
+from .catalogue import TrainType
+from .evidence import Candidate, Explanation, explain
+from .kinematics import Motion, robust_scale
+from .passage import Hypothesis, Passage
+from .passage_scan import Scanned, recentred, see
+
+Array = NDArray[np.float64]
+
+CERTAIN = 0.99
+"""Probability of a type, by its pattern alone, that teaches where the channels are."""
+
+_TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
+_UNSTATED = 0.5  # m, distance between channels of no use
+
+
+def fit_hypotheses(
+    usable: Sequence[Scanned],
+    trains: Sequence[TrainType],
+    limits: tuple[float, float],
+    site: Calibration,
+) -> Passage:
+    """The train that channels show: the types fitted to them, with their probabilities.
+
+    Args:
+        usable: channels that show a pattern, reference first.
+        trains: candidate types.
+        limits: lowest and highest speed (m/s).
+        site: where the channels are.
+    """
+    reference = usable[0]
+    seen = see(usable, trains, limits)
+    direction, kept, offsets = seen.direction, seen.kept, seen.offsets
+    fitted: list[Hypothesis] = []
+    aligned: list[list[Array]] = []
+    names = tuple(s.trace.name for s, _ in kept)
+    stated = np.array([s.trace.x - reference.trace.x for s, _ in kept])
+    offset, covariance = site.relative(names)
+    shifts = (direction or 1) * (stated + offset)
+    for match in seen.matches:
+        score = match.score
+        if score < seen.matches[0].score - 0.25:
+            continue
+        places = match.train.oriented(match.reverse)
+        aligned.append([places + delay * match.speed for _, delay in kept])
+        fit = fit_axles(
+            [s.trace for s, _ in kept],
+            # where the pattern was seen; whether the distance agrees is for the evidence to say
+            aligned[-1],
+            recentred(match),
+            [s.low for s, _ in kept],
+            [s.wave for s, _ in kept],
+        )
+        if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
+            aligned.pop()
+            continue
+        fitted.append(Hypothesis(match.train, match.reverse, direction, score, fit))
+    fitted = _same_times(fitted, aligned)
+    waves = tuple(s.wave for s, _ in kept)
+    candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance, waves) for h in fitted]
+    explanations = explain(candidates)
+    if explanations and explanations[0].kind == "clock":
+        wrong = kept[explanations[0].channel][0]
+        fit, motion = fitted[explanations[0].candidate].fit, explanations[0].motion
+        k = explanations[0].channel
+        late = fit.time[k] - motion.time_at(
+            candidates[explanations[0].candidate].places + shifts[k]
+        )
+        told = (wrong.trace.name, float(np.median(late)), 0.2 / motion.speed)
+        rest = [s for s in usable if s.trace is not wrong.trace]
+        passage = fit_hypotheses(rest, trains, limits, site)
+        return replace(
+            passage,
+            clock_offset=(*passage.clock_offset, told),
+            quality=tuple({*passage.quality, "unsynchronised"}),
+        )
+    hypotheses = _with_probabilities(fitted, explanations)
+    passage = Passage(
+        interval=reference.interval,
+        traces=tuple(s.trace for s, _ in kept),
+        band=reference.band,
+        hypotheses=tuple(hypotheses),
+        direction=direction,
+        explanations=tuple(explanations),
+        clock_offset=tuple(offsets),
+        quality=("unsynchronised",) if offsets else (),
+    )
+    if hypotheses and direction:
+        last = int(np.argmax(np.abs(stated)))
+        passage = replace(
+            passage,
+            delay=delay_speed(passage),
+            measured=_measure(candidates, names, direction * stated, direction),
+            baseline=(float(offset[last]), float(covariance[last, last] ** 0.5), site.passages),
+        )
+    return passage
+
+
+def _same_times(
+    trains: Sequence[Hypothesis], aligned: Sequence[Sequence[Array]]
+) -> list[Hypothesis]:
+    """Types of one shape with the same wheelset times, those of the closest fit.
+
+    A pulse mistaken under one of them must not decide between types that differ by a per cent.
+    """
+    out = []
+    for own, places in zip(trains, aligned, strict=True):
+        twins = [h for h in trains if _one_shape(h.places, own.places)]
+        closest = min(twins, key=lambda h: h.fit.scale)
+        fit = own.fit if closest is own else refit(closest.fit, places)
+        out.append(replace(own, fit=fit))
+    return out
+
+
+def _one_shape(a: Array, b: Array) -> bool:
+    """Whether places (m) differ by no more than their size."""
+    if a.size != b.size:
+        return False
+    return float(np.max(np.abs(a * (a @ b) / (a @ a) - b))) < _TWIN
+
+
+def _measure(
+    candidates: Sequence[Candidate], names: tuple[str, ...], stated: Array, direction: int
+) -> Measured | None:
+    """Where the channels are, from a train that its pattern alone tells."""
+    free = _UNSTATED**2 * (np.eye(len(names)) + 1.0)
+    free[0] = free[:, 0] = 0.0
+    alone = [replace(c, shifts=stated, site=free) for c in candidates]
+    best = explain(alone)[0]
+    if best.kind != "type" or best.probability < CERTAIN:
+        return None
+    fit = candidates[best.candidate].fit
+    if not fit.used.any(axis=1).all():
+        return None
+    ahead = best.motion.distance_at(fit.time) - candidates[best.candidate].places
+    shift = np.array([np.median(row[seen]) for row, seen in zip(ahead, fit.used, strict=True)])
+    variance = fit.place_sigma**2 + fit.scale**2 / fit.used.sum(axis=1)
+    covariance = np.diag(variance) + variance[0]
+    covariance[0] = covariance[:, 0] = 0.0
+    return Measured(names, direction * (shift - shift[0] - stated), covariance)
+
+
+def _with_probabilities(
+    trains: Sequence[Hypothesis], explanations: Sequence[Explanation]
+) -> list[Hypothesis]:
+    """Types with their probabilities and their motion, most probable first.
+
+    If no type of the catalogue is likely, the order is that of the relatives.
+    """
+    total = np.zeros(len(trains))
+    related = np.zeros(len(trains))
+    motion: dict[int, Motion] = {}
+    phase: dict[int, float] = {}
+    unknown = sum(e.probability for e in explanations if e.kind in ("scaled", "varied")) > 0.5
+    for e in explanations:
+        if e.kind == "type":
+            total[e.candidate] += e.probability
+            phase[e.candidate] = e.phase
+        related[e.candidate] += e.probability
+        if (e.kind == "type") != unknown:
+            motion.setdefault(e.candidate, e.motion)
+    order = np.argsort(-(related if unknown else total))
+    return [
+        replace(
+            trains[i],
+            probability=float(total[i]),
+            phase=phase.get(int(i), 0.0),
+            fit=replace(trains[i].fit, motion=motion.get(int(i), trains[i].fit.motion)),
+        )
+        for i in order
+    ]
+
+
+def delay_speed(passage: Passage) -> tuple[float, float] | None:
+    """Mean speed (m/s, sigma) at mid-train from wheelset delays between the outer two channels.
+
+    Needs the pairing of wheelsets only, not their spacing: independent of the catalogue.
+    """
+    best = passage.hypotheses[0]
+    if len(passage.traces) < 2:
+        return None
+    fit = best.fit
+    x = np.array([trace.x for trace in passage.traces])
+    a, b = int(np.argmin(x)), int(np.argmax(x))
+    both = fit.used[a] & fit.used[b]
+    if both.sum() < 4 or x[b] - x[a] < 0.5:
+        return None
+    delay = np.abs(fit.time[b, both] - fit.time[a, both])
+    expected = np.abs(
+        fit.motion.time_at(best.places[both] + passage.direction * (x[b] - passage.traces[0].x))
+        - fit.motion.time_at(best.places[both] + passage.direction * (x[a] - passage.traces[0].x))
+    )
+    ratio = delay / expected
+    centre = float(np.median(ratio))
+    spread = max(robust_scale(ratio - centre, 1), 1e-6)
+    good = np.abs(ratio - centre) < 4 * spread
+    mean = float(ratio[good].mean())
+    sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
+    speed = float(fit.motion.speed_at(best.mid_time)) / mean
+    baseline = float(np.hypot(*fit.place_sigma[[a, b]])) / (x[b] - x[a])
+    return speed, speed * float(np.hypot(sigma / mean, baseline))
