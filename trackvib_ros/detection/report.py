@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .blind import CONFIDENT, Blind
-from .catalogue import Catalogue
+from .catalogue import Catalogue, TrainType
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
 from .evidence import half_interval
 from .health import clipped
@@ -16,11 +16,11 @@ from .live import Partial
 from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage
 from .record import Record
 from .response import CONFIRM_EVIDENCE, ResponsePassage
+from .summary import DIRECTION, Summary
 from .unlisted import CAR
 
 Array = NDArray[np.float64]
 
-_DIRECTION = {1: "forward", -1: "backward", 0: "unknown"}
 _UNITS = {1: "single", 2: "double"}
 _GEOMETRY = 0.03  # m, wheelsets of a train against its type
 _WHEELBASE = 0.1  # m, half of what wheelbases differ by: that of an unknown type is not measured
@@ -48,7 +48,7 @@ def update(found: Partial, now_ns: int) -> TrainEvent:
     """A provisional speed while the train passes."""
     values: dict[str, Value] = {
         "speed": Estimate(found.speed, found.sigma, "m/s"),
-        "direction": _DIRECTION[found.direction],
+        "direction": DIRECTION[found.direction],
         "passed": Estimate(found.distance, 2.0, "m"),
     }
     if found.types:
@@ -110,7 +110,7 @@ def truncated(catalogue: Catalogue, found: Partial, origin_ns: int) -> list[Trai
                 "departure_sigma": end_sigma,
                 "speed": Estimate(found.speed, found.sigma, "m/s"),
                 "speed_at": "middle of the part on record at the reference point",
-                "direction": _DIRECTION[found.direction],
+                "direction": DIRECTION[found.direction],
                 "type": "unknown",
                 "types_of_the_end": found.types,
                 "families": found.families,
@@ -312,22 +312,22 @@ def _train(
         if fit.observed[0, -1]:
             last, last_sigma = float(fit.time[0, -1]), direct / speed
     passing_sigma = 2**0.5 * fit.scale / speed
+    summary = Summary(
+        sensors=names,
+        x=reference.x,
+        arrival=(first, first_sigma),
+        departure=(last, last_sigma),
+        passing_sigma=passing_sigma,
+        speed=(speed, sigma),
+        interval=interval,
+        acceleration=(motion.acceleration, motion.acceleration_sigma),
+        direction=passage.direction,
+        method=method,
+        confidence=float(np.clip(best.score, 0.0, 0.99)),
+        quality=tuple(quality),
+    )
     values: dict[str, Value] = {
-        "grade": CONFIRMED,
-        "reference": reference.name,
-        "reference_x": Estimate(reference.x, 0.0, "m"),
-        "arrival_ns": stamp(first),
-        "arrival_sigma": first_sigma,
-        "departure_ns": stamp(last),
-        "departure_sigma": last_sigma,
-        "passing_time": Estimate(last - first, passing_sigma, "s"),
-        "speed": Estimate(speed, sigma, "m/s"),
-        "speed_interval": tuple(round(v, 6) for v in interval),
-        "speed_at": "middle of the train at the reference point",
-        "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
-        "direction": _DIRECTION[passage.direction],
         "axle_count": int(places.size),
-        "type": train.name if known else "unknown",
         "type_probability": round(best.probability, 4),
         "families": families(passage.hypotheses),
         "unknown_probability": round(passage.unknown, 4),
@@ -336,58 +336,51 @@ def _train(
             for h in passage.hypotheses
             if h.probability > 1e-3
         ),
-        "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
-        "cars": train.cars if known else "unknown",
-        "units": _UNITS.get(train.units, str(train.units)) if known else "unknown",
         "score": round(best.score, 4),
         "speed_template": Estimate(float(motion.speed_at(best.mid_time)), own, "m/s"),
-        "catalogue": catalogue.version,
     }
-    duration = last - first
     if known:
-        values["train_length"] = Estimate(train.length, train.length * sigma / speed, "m")
-        values["speed_passing_time"] = Estimate(
-            train.span / duration, train.span / duration**2 * passing_sigma, "m/s"
-        )
+        duration = summary.duration
+        values |= _identity(train, best.reverse) | {
+            "train_length": Estimate(train.length, train.length * sigma / speed, "m"),
+            "speed_passing_time": Estimate(
+                train.span / duration, train.span / duration**2 * passing_sigma, "m/s"
+            ),
+        }
     else:
         passed = np.where(fit.used[0], fit.time[0], motion.time_at(places))
         gaps = np.diff(motion.distance_at(passed))
         length = train.length - train.span + float(gaps.sum())
-        values["train_length"] = Estimate(length, float(np.hypot(length * sigma / speed, 1.0)), "m")
-        values["axle_spacings"] = tuple(round(float(gap), 2) for gap in gaps)
-        values["axle_spacing_sigma"] = round(float(np.hypot(0.2, 2.5 * sigma / speed)), 3)
+        values |= {
+            "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
+            "train_length": Estimate(length, float(np.hypot(length * sigma / speed, 1.0)), "m"),
+            **_spacings(gaps, float(np.hypot(0.2, 2.5 * sigma / speed))),
+        }
     if passage.delay is not None:
         values["speed_delay"] = Estimate(*passage.delay, "m/s")
     if passage.baseline is not None:
         correction, uncertainty, learned = passage.baseline
         values["baseline_correction"] = Estimate(correction, uncertainty, "m")
         values["baseline_passages"] = learned
-    confidence = float(np.clip(best.score, 0.0, 0.99))
-    events.append(
-        TrainEvent(
-            kind="departure",
-            stamp_ns=stamp(last),
-            sigma_s=last_sigma,
-            confidence=confidence,
-            method=method,
-            sensors=names,
-            values={"grade": CONFIRMED, "reference_x": Estimate(reference.x, 0.0, "m")},
-            quality=tuple(quality),
-        )
-    )
-    events.append(
-        TrainEvent(
-            kind="passage",
-            stamp_ns=stamp(first),
-            sigma_s=first_sigma,
-            confidence=confidence,
-            method=method,
-            sensors=names,
-            values=values,
-            quality=tuple(quality),
-        )
-    )
-    return events
+    return [*events, *summary.events(origin_ns, catalogue.version, values)]
+
+
+def _identity(train: TrainType, reverse: bool) -> dict[str, Value]:
+    """What a named type says of a train."""
+    return {
+        "type": train.name,
+        "reversed": "unknown" if train.symmetric else ("yes" if reverse else "no"),
+        "cars": train.cars,
+        "units": _UNITS.get(train.units, str(train.units)),
+    }
+
+
+def _spacings(gaps: Array, sigma: float) -> dict[str, Value]:
+    """Distances between the wheelsets of an unknown train (m)."""
+    return {
+        "axle_spacings": tuple(round(float(gap), 2) for gap in gaps),
+        "axle_spacing_sigma": round(sigma, 3),
+    }
 
 
 def response(
@@ -414,9 +407,7 @@ def response(
     for p, fit in zip(passage.probabilities, passage.fits, strict=True):
         grouped[fit.train.family] = grouped.get(fit.train.family, 0.0) + p
         listed[fit.train.name] = listed.get(fit.train.name, 0.0) + p
-    reference = passage.channels[0]
     names = tuple(channel.name for channel in passage.channels)
-    method = "one common response per wheelset, least squares"
     quality = ["axles_not_visible", "speed_scales_with_type"]
     if not passage.known:
         quality.append("unknown_type")
@@ -432,61 +423,43 @@ def response(
         pairs = sorted(table.items(), key=lambda item: -item[1])
         return tuple((name, round(p, 4)) for name, p in pairs if p > 1e-3)
 
-    def stamp(time: float) -> int:
-        return origin_ns + round(time * 1e9)
-
-    duration = last - first
-    place = Estimate(reference.x, 0.0, "m")
     values: dict[str, Value] = {
-        "grade": CONFIRMED,
-        "reference": reference.name,
-        "reference_x": place,
-        "arrival_ns": stamp(first),
-        "arrival_sigma": edge,
-        "departure_ns": stamp(last),
-        "departure_sigma": edge,
-        "passing_time": Estimate(duration, duration * passage.relative, "s"),
-        "speed": Estimate(best.speed, sigma, "m/s"),
-        "speed_interval": tuple(round(v, 6) for v in (best.speed - half, best.speed + half)),
-        "speed_at": "middle of the train at the reference point",
-        "direction": _DIRECTION[passage.direction],
-        "type": "unknown",
         "unknown_probability": round(passage.unknown, 4),
-        "cars": "unknown",
-        "units": "unknown",
         "train_length": Estimate(train.length, train.length * sigma / best.speed, "m"),
         "evidence": round(best.evidence, 1),
-        "catalogue": catalogue.version,
     }
+    acceleration = motion.acceleration, motion.acceleration_sigma
     if passage.known:
-        values |= {
-            "acceleration": Estimate(motion.acceleration, motion.acceleration_sigma, "m/s^2"),
+        values |= _identity(train, best.reverse) | {
             "axle_count": train.axles.size,
             "axle_count_of": "the type",
-            "type": train.name,
             "type_probability": round(named, 4),
             "types": ranked(listed),
             "families": ranked(grouped),
-            "reversed": "unknown" if train.symmetric else ("yes" if best.reverse else "no"),
-            "cars": train.cars,
-            "units": _UNITS.get(train.units, str(train.units)),
             "speed_passing_time": Estimate(*passage.by_duration, "m/s"),
         }
     else:
-        own = float(np.sqrt(motion.covariance[2, 2]))
-        bend = float(np.hypot(own, CAR[1] * motion.acceleration))
-        values["acceleration"] = Estimate(motion.acceleration, bend, "m/s^2")
+        bend = float(np.hypot(motion.acceleration_sigma, CAR[1] * motion.acceleration))
+        acceleration = motion.acceleration, bend
         cars = best.speed / CAR[0]
         values["car_rate"] = Estimate(cars, cars * passage.relative, "Hz")
     if passage.spectral is not None:
         values["speed_spectrum"] = Estimate(*passage.spectral, "m/s")
-    confidence = float(np.clip(1 - CONFIRM_EVIDENCE / (2 * best.evidence), 0.0, 0.99))
-    flags = tuple(dict.fromkeys(quality))
-    short: dict[str, Value] = {"grade": CONFIRMED, "reference_x": place}
-    return [
-        TrainEvent("departure", stamp(last), edge, confidence, method, names, short, flags),
-        TrainEvent("passage", stamp(first), edge, confidence, method, names, values, flags),
-    ]
+    summary = Summary(
+        sensors=names,
+        x=passage.channels[0].x,
+        arrival=(first, edge),
+        departure=(last, edge),
+        passing_sigma=(last - first) * passage.relative,
+        speed=(best.speed, sigma),
+        interval=(best.speed - half, best.speed + half),
+        acceleration=acceleration,
+        direction=passage.direction,
+        method="one common response per wheelset, least squares",
+        confidence=float(np.clip(1 - CONFIRM_EVIDENCE / (2 * best.evidence), 0.0, 0.99)),
+        quality=tuple(dict.fromkeys(quality)),
+    )
+    return list(summary.events(origin_ns, catalogue.version, values))
 
 
 def _unknown(
@@ -502,18 +475,11 @@ def _unknown(
         quality = (*quality, "axle_count_not_confident")
     speed, sigma = blind.speed
     times = blind.times
-    grade = CONFIRMED if passage.confirmed else VIBRATION
-    confidence = float(np.clip(max(blind.correlation, passage.score), 0.0, 0.95))
-
-    def stamp(time: float) -> int:
-        return origin_ns + round(time * 1e9)
-
     time_sigma = np.hypot(blind.time_sigma, _PULSE_SIGMA_S)
-    ends = {"departure": float(time_sigma[-1]), "passage": float(time_sigma[0])}
-    events = [
+    axles = [
         TrainEvent(
             kind="axle",
-            stamp_ns=stamp(float(time)),
+            stamp_ns=origin_ns + round(float(time) * 1e9),
             sigma_s=float(sigma_s),
             confidence=0.9 * blind.regular,
             method=blind.axle_method,
@@ -522,53 +488,29 @@ def _unknown(
         )
         for number, (time, sigma_s) in enumerate(zip(times, time_sigma, strict=True), 1)
     ]
-    spacings = blind.spacings
-    span = float(spacings.sum())
-    duration = float(times[-1] - times[0])
-    acceleration = Estimate(blind.motion.acceleration, blind.motion.acceleration_sigma, "m/s^2")
+    summary = Summary(
+        sensors=blind.sensors,
+        x=blind.x,
+        arrival=(float(times[0]), float(time_sigma[0])),
+        departure=(float(times[-1]), float(time_sigma[-1])),
+        passing_sigma=float(np.hypot(*time_sigma[[0, -1]])),
+        speed=blind.speed,
+        interval=blind.interval,
+        acceleration=(blind.motion.acceleration, blind.motion.acceleration_sigma),
+        direction=blind.direction,
+        method=blind.method,
+        confidence=float(np.clip(max(blind.correlation, passage.score), 0.0, 0.95)),
+        quality=tuple(quality),
+        grade=CONFIRMED if passage.confirmed else VIBRATION,
+    )
+    span = float(blind.spacings.sum())
     values: dict[str, Value] = {
-        "grade": grade,
-        "reference": blind.sensors[0],
-        "reference_x": Estimate(blind.x, 0.0, "m"),
-        "arrival_ns": stamp(float(times[0])),
-        "arrival_sigma": ends["passage"],
-        "departure_ns": stamp(float(times[-1])),
-        "departure_sigma": ends["departure"],
-        "passing_time": Estimate(
-            duration, float(np.hypot(ends["passage"], ends["departure"])), "s"
-        ),
-        "speed": Estimate(speed, sigma, "m/s"),
-        "speed_at": "middle of the train at the reference point",
-        "acceleration": acceleration,
-        "direction": _DIRECTION[blind.direction],
         "axle_count": int(times.size),
         "axle_count_confidence": round(blind.regular, 3),
-        "type": "unknown",
         "families": families(passage.hypotheses),
-        "cars": "unknown",
-        "units": "unknown",
         "train_length": Estimate(span, float(np.hypot(span * sigma / speed, 0.5)), "m"),
-        "axle_spacings": tuple(round(float(gap), 2) for gap in spacings),
-        "axle_spacing_sigma": round(float(np.hypot(blind.spacing_sigma, 2.5 * sigma / speed)), 3),
+        **_spacings(blind.spacings, float(np.hypot(blind.spacing_sigma, 2.5 * sigma / speed))),
         "score": round(passage.score, 4),
         "correlation": round(blind.correlation, 4),
-        "catalogue": catalogue.version,
     }
-    if blind.interval is not None:
-        values["speed_interval"] = tuple(round(v, 6) for v in blind.interval)
-    for kind, time in (("departure", times[-1]), ("passage", times[0])):
-        events.append(
-            TrainEvent(
-                kind=kind,  # type: ignore[arg-type]
-                stamp_ns=stamp(float(time)),
-                sigma_s=ends[kind],
-                confidence=confidence,
-                method=blind.method,
-                sensors=blind.sensors,
-                values=values
-                if kind == "passage"
-                else {"grade": grade, "reference_x": Estimate(blind.x, 0.0, "m")},
-                quality=tuple(quality),
-            )
-        )
-    return events
+    return [*axles, *summary.events(origin_ns, catalogue.version, values)]
