@@ -153,7 +153,9 @@ class GroupStream:
         self.step = self.decimation / self.rate
         self.frame_bins = max(1, round(FRAME_S / self.step))
         self.frame_s = self.frame_bins * self.step
-        self._to_end_ns = dt_ns * (self.decimation - (self.decimation - 1) // 2)
+        # every ``_first``-th sample of a bin is in its mean, from the first sample on
+        self._centre_ns = dt_ns * (self.decimation - self._first) // 2
+        self._to_end_ns = dt_ns * self.decimation - self._centre_ns
         self.bands = bands_for(self.rate, slow)
         top = min(_INNER_TOP, 0.45 * self.rate)
         self._front = signal.bessel(4, top, "low", norm="mag", fs=self.rate, output="sos")
@@ -380,7 +382,7 @@ class GroupStream:
         out[:, :, b + 3] = ~invalid
         out[:, :, b + 4] = holes
         out[:, :, b + 5] = x.reshape(shape).mean(axis=1)
-        stamps = self._pending_ns + self.dt_ns * (np.arange(n, dtype=np.int64) * d + (d - 1) // 2)
+        stamps = self._pending_ns + self.dt_ns * d * np.arange(n, dtype=np.int64) + self._centre_ns
         self._append(out, stamps)
 
     def _append(self, out: NDArray[np.float32], stamps: NDArray[np.int64]) -> None:
