@@ -45,8 +45,8 @@ _CHANGE = 0.3  # m, within which the motion is known already
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
 DEFLECTION_SIGMA = 0.003
-"""What remains in doubt of a place found in this way (m), beside noise and the unknown coupling: rms
-difference of two channels, over 2**0.5, on 60 computed passages at 40 dB, 43 to 380 km/h. What
+"""What remains in doubt of a place found in this way (m), beside noise and the unknown coupling:
+rms difference of two channels, over 2**0.5, on 60 computed passages at 40 dB, 43 to 380 km/h. What
 damped pads make all deflections lag by (rms 0.005 m there) is hardly told from the lead of the
 coupling, and is in its posterior."""
 
