@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from solver import InputError
-from tests.detection.field_like import SEEDS, StandIn, catalogue, stand_in
+from tests.detection.field_like import StandIn, catalogue, stand_in
+from tests.detection.stand_ins import SEEDS
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, TrainDetector, detect
 from trackvib_ros.detection.features import GroupStream, bands_for
 from trackvib_ros.detection.onset import quietest
