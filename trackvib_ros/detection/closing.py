@@ -16,17 +16,18 @@ from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .head import HeadMatcher
 from .health import HealthBook, clipped
-from .live import departed
+from .live import Partial, arrived, departed
 from .passage import Passage
 from .passage_search import bowl_of, find_passages
 from .record import Record
 from .response import find_response
-from .strength import excited
+from .strength import CORE, excited, strong_interval
 
 Array = NDArray[np.float64]
 
 _ENOUGH = 0.5  # of what trains differ by, at which one more teaches little
 _AT_ONCE_S = 0.3  # a record that is quiet for longer starts before the train
+_APART = 3.0  # standard uncertainties, beyond which two speeds are not the same
 _AHEAD = 1.0  # m before a first wheelset that is on record
 
 
@@ -41,6 +42,7 @@ class Ended:
         now_ns: end of the records.
         last_ns: last activity.
         found: its trains, if they are known already.
+        cut: whether the record ends before it is clear that nothing more comes.
         begun: the rail channels from the start of the stream on, and that start (ns), if a train
             was near then; else ``None``.
     """
@@ -51,6 +53,7 @@ class Ended:
     now_ns: int
     last_ns: int
     found: list[Passage] | None = None
+    cut: bool = False
     begun: tuple[list[Record], int] | None = None
 
 
@@ -100,6 +103,12 @@ class Closing:
                 part = self._truncated(rails, start_ns, ended.last_ns, _whole(found, begin))
                 if part is not None:
                     return part
+        elif ended.cut:
+            rails = [r for r in records if r.channel.layer == "rail"]
+            stop = (ended.now_ns - ended.origin_ns) * 1e-9
+            head = arrived(rails, (within[0], stop), self._limits, self._heads)
+            if head is not None and not _over(found, within, head):
+                return report.truncated(self._catalogue, head, ended.origin_ns, ended.now_ns)
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
             away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
             # strong first cars end an event on a bridge early; what rings on does no harm
@@ -134,6 +143,10 @@ class Closing:
                 )
 
     @cached_property
+    def _heads(self) -> HeadMatcher:
+        return HeadMatcher(self._catalogue.types, self._limits)
+
+    @cached_property
     def _mirrored(self) -> HeadMatcher:
         return HeadMatcher(self._catalogue.types, self._limits, mirrored=True)
 
@@ -151,7 +164,7 @@ class Closing:
         within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
         found, quiet = departed(rails, within, self._limits, self._mirrored)
         if found is not None:
-            return report.truncated(self._catalogue, found, start_ns)
+            return report.truncated(self._catalogue, found, start_ns, last_ns)
         if quiet > _AT_ONCE_S or whole:
             return None
         return report.unclear(rails, last_ns, ("truncated_start",))
@@ -209,3 +222,29 @@ def _whole(found: Sequence[Passage], start: float) -> bool:
     if not found or not found[0].confirmed or not found[0].hypotheses:
         return False
     return float(found[0].hypotheses[0].fit.motion.time_at(-_AHEAD)) > start
+
+
+def _over(found: Sequence[Passage], within: tuple[float, float], head: Partial) -> bool:
+    """Whether the last of the trains has passed, and is not the beginning of a longer one.
+
+    What the rail carries is heard before the first wheelset as after the last: what is strong for
+    longer after it, and for more than the longest gap of the train, is more of it. And a train that
+    goes on can look like a shorter one that is faster.
+
+    Args:
+        found: trains.
+        within: the event (s).
+        head: what its beginning tells, whole trains among the rest.
+    """
+    if not found or not found[-1].confirmed:
+        return False
+    train = found[-1]
+    core = strong_interval(train.traces[0], train.band[1] - train.band[0], within, CORE)
+    if not train.known or core is None:
+        return True
+    best, motion = train.hypotheses[0], train.hypotheses[0].fit.motion
+    ahead, behind = motion.distance_at(np.array(core)) - best.places[[0, -1]]
+    if behind - max(0.0, -ahead) > np.max(np.diff(best.places)):
+        return False
+    sigma = np.hypot(head.sigma, motion.speed_sigma(best.mid_time))
+    return bool(abs(head.speed - motion.speed_at(best.mid_time)) < _APART * sigma)

@@ -206,7 +206,7 @@ class TrainDetector:
                 self._replay = False
                 events += self._frames(2**62)
         if self._event is not None:
-            events += self._close(now)
+            events += self._close(now, cut=True)
         return events
 
     def _group_of(self, block: Waveform) -> Group:
@@ -483,7 +483,7 @@ class TrainDetector:
         levels = zip(group.index, group.trigger.level, strict=True)
         return np.array([self._fresh(channel, float(level), now_ns) for channel, level in levels])
 
-    def _close(self, now_ns: int, past: _Past | None = None) -> list[TrainEvent]:
+    def _close(self, now_ns: int, past: _Past | None = None, cut: bool = False) -> list[TrainEvent]:
         event = self._event
         assert event is not None
         self._event = None
@@ -506,7 +506,9 @@ class TrainDetector:
         ends = {c: past.clear_ns[c] for c in past.next_ns} if past else {}
         records = self._records(event, origin, now_ns, ends)
         found = past.found if past else None
-        return self._closing.conclude(Ended(records, origin, within, now_ns, last, found, begun))
+        return self._closing.conclude(
+            Ended(records, origin, within, now_ns, last, found, cut, begun)
+        )
 
     def _records(
         self, event: _Event, from_ns: int, to_ns: int, ends: Mapping[int, int] | None = None

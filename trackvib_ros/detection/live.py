@@ -15,7 +15,7 @@ from .strength import excited, strong_interval
 
 AXLE_SPACING = 6.2
 """Track per wheelset of a train on bogies (m), to count how many have passed."""
-_END_SIGMA = 0.6  # m, place of the last wheelset by the end of strong energy
+_END_SIGMA = 0.6  # m, place of the first or last wheelset by the strong energy
 _CAR = 26.0  # m, a train shows its next bogie within a car
 
 
@@ -33,8 +33,8 @@ class Partial:
         method: how the speed was obtained.
         types: catalogue types with their probabilities; empty if no pattern was compared.
         families: the same for families.
-        end: time (s) and sigma of the last wheelset at the first of the sensors; ``None`` while it
-            passes.
+        start: time (s) and sigma of the first wheelset at the first of the sensors, if on record.
+        end: the same of the last wheelset; ``None`` while the train passes.
         x: position of the first of the sensors (m).
     """
 
@@ -48,6 +48,7 @@ class Partial:
     method: str
     types: tuple[tuple[str, float], ...] = ()
     families: tuple[tuple[str, float], ...] = ()
+    start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
     x: float = 0.0
 
@@ -112,19 +113,7 @@ def _by_pattern(
             best = head
     if best is None or not best.clear:
         return None
-    return Partial(
-        best.speed,
-        best.sigma,
-        0,
-        best.score,
-        best.distance,
-        best.passed,
-        (record.channel.name,),
-        "axle pattern of the first wheelsets",
-        best.types,
-        best.families,
-        x=record.channel.x,
-    )
+    return _of_head(best, record, "axle pattern of the first wheelsets")
 
 
 def _mirrored(trace: Trace) -> Trace:
@@ -176,7 +165,53 @@ def departed(
         return None, quiet
     if head.speed * quiet > _CAR:
         return None, np.inf
-    found = Partial(
+    found = _of_head(head, record, "axle pattern of the end of the train")
+    found = replace(found, end=(end, _edge_sigma(head)))
+    return _with_delay(found, rails, within, limits), quiet
+
+
+def arrived(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    matcher: HeadMatcher,
+) -> Partial | None:
+    """A train that still passes when the record ends, by the pattern of its beginning.
+
+    Args:
+        records: of the rail channels.
+        within: the event, to the end of the record (s).
+        limits: speeds (m/s).
+        matcher: for the first wheelsets.
+
+    Returns:
+        ``None`` if it shows no clear pattern, or if the record ends so quiet that it has passed.
+    """
+    rails = sorted((r for r in records if excited(r, within)), key=lambda r: r.channel.x)
+    best: tuple[Head, Record, float] | None = None
+    for record in rails:
+        stop = min(within[1], float(record.window.time[-1]))
+        for trace, (low, high) in zip(record.traces(within), record.window.bands, strict=True):
+            interval = strong_interval(trace, high - low, within)
+            if interval is None:
+                continue
+            head = matcher.match(trace, interval[0], stop)
+            if head and (best is None or head.score > best[0].score):
+                best = head, record, stop - interval[1]
+    if best is None or not best[0].clear or best[0].speed * best[2] > _CAR:
+        return None
+    head, record, _ = best
+    found = _of_head(head, record, "axle pattern of the beginning of the train")
+    found = replace(found, start=(head.start, _edge_sigma(head)))
+    return _with_delay(found, rails, within, limits)
+
+
+def _edge_sigma(head: Head) -> float:
+    return float(np.hypot(_END_SIGMA / head.speed, 0.005))
+
+
+def _of_head(head: Head, record: Record, method: str) -> Partial:
+    return Partial(
         head.speed,
         head.sigma,
         0,
@@ -184,21 +219,29 @@ def departed(
         head.distance,
         head.passed,
         (record.channel.name,),
-        "axle pattern of the end of the train",
+        method,
         head.types,
         head.families,
-        (end, float(np.hypot(_END_SIGMA / head.speed, 0.005))),
-        record.channel.x,
+        x=record.channel.x,
     )
+
+
+def _with_delay(
+    found: Partial,
+    rails: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+) -> Partial:
+    """What a pattern told, and the delay between the outer two channels if it agrees."""
     delay = None
     if len(rails) > 1 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
         delay = _by_delay(rails[0], rails[-1], within, limits)
     if delay is None or abs(delay.speed - found.speed) > 3 * np.hypot(delay.sigma, found.sigma):
-        return found, quiet
+        return found
     weight = np.array([found.sigma, delay.sigma]) ** -2.0
     others = tuple(name for name in delay.sensors if name not in found.sensors)
     speed = float(weight @ [found.speed, delay.speed] / weight.sum())
-    fused = replace(
+    return replace(
         found,
         speed=speed,
         distance=found.distance * speed / found.speed,
@@ -207,4 +250,3 @@ def departed(
         sensors=(*found.sensors, *others),
         method=f"{found.method}, {delay.method}",
     )
-    return fused, quiet

@@ -69,50 +69,62 @@ def update(found: Partial, now_ns: int) -> TrainEvent:
     )
 
 
-def truncated(catalogue: Catalogue, found: Partial, origin_ns: int) -> list[TrainEvent]:
-    """Departure and summary of a train in which the record begins: no arrival, no count, no type.
+def truncated(
+    catalogue: Catalogue, found: Partial, origin_ns: int, end_ns: int
+) -> list[TrainEvent]:
+    """Departure and summary of a train of which only an end is on record: no count, no type.
 
     Args:
         catalogue: for its version and its longest train.
-        found: the part on record, with its end.
-        origin_ns: start of the record.
+        found: the part on record, with its first or its last wheelset.
+        origin_ns: what its times (s) are from: the start of the record if that lies in the train.
+        end_ns: end of the record if that lies in the train.
     """
-    assert found.end is not None
-    end_ns, end_sigma = origin_ns + round(found.end[0] * 1e9), found.end[1]
+    edge = found.start or found.end
+    assert edge is not None
+    edge_ns, edge_sigma = origin_ns + round(edge[0] * 1e9), edge[1]
     longest = max(train.span for train in catalogue)
+    # a train may have begun to pass as long before as the longest one takes, or go on as long
+    unseen = max(longest - found.distance, 0.0) / found.speed + edge_sigma
     confidence = float(np.clip(found.score, 0.0, 0.95))
     place = Estimate(found.x, 0.0, "m")
     part = found.distance * found.sigma / found.speed
+    begun = found.start is None
+    missing = "arrival" if begun else "departure"
+    flags = ("truncated_start" if begun else "truncated_end",)
+    stamped = f"stamped with the {'start' if begun else 'end'} of the record, {missing} unknown"
+    seen = "departure" if begun else "arrival"
+    arrival = (origin_ns, unseen) if begun else (edge_ns, edge_sigma)
+    departure = (edge_ns, edge_sigma) if begun else (end_ns, unseen)
     return [
         TrainEvent(
             kind="departure",
-            stamp_ns=end_ns,
-            sigma_s=end_sigma,
+            stamp_ns=departure[0],
+            sigma_s=departure[1],
             confidence=confidence,
-            method=found.method,
+            method=found.method if begun else f"{found.method}; {stamped}",
             sensors=found.sensors,
             values={"grade": CONFIRMED, "reference_x": place},
-            quality=("truncated_start",),
+            quality=flags,
         ),
         TrainEvent(
             kind="passage",
-            stamp_ns=origin_ns,
-            # the train may have begun to pass as long before as the longest one takes
-            sigma_s=max(longest - found.distance, 0.0) / found.speed + end_sigma,
+            stamp_ns=arrival[0],
+            sigma_s=arrival[1],
             confidence=confidence,
-            method=f"{found.method}; stamped with the start of the record, arrival unknown",
+            method=f"{found.method}; {stamped}" if begun else found.method,
             sensors=found.sensors,
             values={
                 "grade": CONFIRMED,
                 "reference": found.sensors[0],
                 "reference_x": place,
-                "departure_ns": end_ns,
-                "departure_sigma": end_sigma,
+                f"{seen}_ns": edge_ns,
+                f"{seen}_sigma": edge_sigma,
                 "speed": Estimate(found.speed, found.sigma, "m/s"),
                 "speed_at": "middle of the part on record at the reference point",
                 "direction": DIRECTION[found.direction],
                 "type": "unknown",
-                "types_of_the_end": found.types,
+                f"types_of_the_{'end' if begun else 'beginning'}": found.types,
                 "families": found.families,
                 "cars": "unknown",
                 "units": "unknown",
@@ -120,7 +132,7 @@ def truncated(catalogue: Catalogue, found: Partial, origin_ns: int) -> list[Trai
                 "score": round(found.score, 4),
                 "catalogue": catalogue.version,
             },
-            quality=("truncated_start",),
+            quality=flags,
         ),
     ]
 
