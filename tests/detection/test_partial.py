@@ -134,3 +134,37 @@ def test_too_little_of_a_train_is_no_passage():
     for departure in of(events, "departure"):
         assert departure.values["grade"] == VIBRATION
         assert departure.quality == ("truncated_start", "low_score")
+
+
+@pytest.mark.parametrize("rails", [1, 2])
+@pytest.mark.parametrize(("name", "share"), [("articulated", 0.6), ("CRH3x2", 0.8)])
+def test_a_record_that_ends_inside_a_train(name, share, rails):
+    truth = Passage(CATALOGUE[name].axles, 50.0)
+    times = truth.axle_times(0.0)
+    cut = round(RATE * ((1 - share) * times[0] + share * times[-1]))
+    events = detect(RATE, samples(truth, RAILS[:rails])[:cut], RAILS[:rails])
+    (passage,), (departure,) = of(events, "passage"), of(events, "departure")
+    assert passage.quality == departure.quality == ("truncated_end",)
+    told = passage.values["speed"]
+    assert 0 < told.sigma < 0.15 * told.value
+    assert abs(told.value - truth.speed) < 2.5 * told.sigma
+    first = truth.axle_times({"rail_a": 0.0, "rail_b": 20.0}[passage.values["reference"]])[0]
+    assert abs(passage.stamp_ns * 1e-9 - first) < 2.5 * passage.sigma_s
+    assert passage.values["arrival_ns"] == passage.stamp_ns
+    # what came after the record is not claimed: the train left later, by no more than the longest
+    assert departure.stamp_ns * 1e-9 == pytest.approx(cut / RATE, abs=0.02)
+    assert times[-1] < departure.stamp_ns * 1e-9 + departure.sigma_s
+    assert not {"departure_ns", "passing_time", "axle_count", "train_length"} & set(passage.values)
+    assert not of(events, "axle") and passage.values["type"] == "unknown"
+    assert "departure unknown" in departure.method
+
+
+@pytest.mark.parametrize("rails", [1, 2])
+def test_the_middle_of_a_train_is_no_shorter_train(rails):
+    truth = Passage(CATALOGUE["CRH3x2"].axles, 25.0)
+    times = truth.axle_times(0.0)
+    inside = slice(round(RATE * (times[0] + 2.0)), round(RATE * (times[0] + 7.0)))
+    for event in of(detect(RATE, samples(truth, RAILS[:rails])[inside], RAILS[:rails]), "passage"):
+        told = event.values["speed"]
+        assert abs(told.value - truth.speed) < 3 * told.sigma
+        assert {"truncated_start", "truncated_end"} & set(event.quality)

@@ -100,14 +100,14 @@ class Closing:
             rails, start_ns = ended.begun
             begin = (start_ns - ended.origin_ns) * 1e-9
             if not (_whole(found, begin) and found[0].known):
-                part = self._truncated(rails, start_ns, ended.last_ns, _whole(found, begin))
+                part = self._truncated(rails, start_ns, ended, _whole(found, begin))
                 if part is not None:
                     return part
-        elif ended.cut:
+        elif ended.cut and len(found) <= 1:
             rails = [r for r in records if r.channel.layer == "rail"]
             stop = (ended.now_ns - ended.origin_ns) * 1e-9
             head = arrived(rails, (within[0], stop), self._limits, self._heads)
-            if head is not None and not _over(found, within, head):
+            if head is not None and not _passed(found, within, head):
                 return report.truncated(self._catalogue, head, ended.origin_ns, ended.now_ns)
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
             away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
@@ -151,21 +151,30 @@ class Closing:
         return HeadMatcher(self._catalogue.types, self._limits, mirrored=True)
 
     def _truncated(
-        self, rails: list[Record], start_ns: int, last_ns: int, whole: bool
+        self, rails: list[Record], start_ns: int, ended: Ended, whole: bool
     ) -> list[TrainEvent] | None:
         """Events of a train whose beginning is not on record; ``None`` if that is not so.
 
         Args:
             rails: records of the rail channels.
             start_ns: begin of the record.
-            last_ns: end of the event.
+            ended: the event.
             whole: whether the pattern of a train that is on record as a whole was found.
         """
+        last_ns, end = ended.last_ns, (ended.now_ns - start_ns) * 1e-9
         within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
-        found, quiet = departed(rails, within, self._limits, self._mirrored)
-        if found is not None:
+        found, late = departed(rails, within, self._limits, self._mirrored)
+        if found is not None and found.end is not None:
+            quiet_s = end - found.end[0]
+            if (
+                ended.cut
+                and found.direction == 0
+                and quiet_s < self._catalogue.longest_gap / found.speed
+            ):
+                # neither end may be on record, and no second channel confirms the speed
+                return report.unclear(rails, last_ns, ("truncated_start", "truncated_end"))
             return report.truncated(self._catalogue, found, start_ns, last_ns)
-        if quiet > _AT_ONCE_S or whole:
+        if late > _AT_ONCE_S or whole:
             return None
         return report.unclear(rails, last_ns, ("truncated_start",))
 
@@ -224,8 +233,8 @@ def _whole(found: Sequence[Passage], start: float) -> bool:
     return float(found[0].hypotheses[0].fit.motion.time_at(-_AHEAD)) > start
 
 
-def _over(found: Sequence[Passage], within: tuple[float, float], head: Partial) -> bool:
-    """Whether the last of the trains has passed, and is not the beginning of a longer one.
+def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial) -> bool:
+    """Whether a train of a known type has passed, and is not the beginning of a longer one.
 
     What the rail carries is heard before the first wheelset as after the last: what is strong for
     longer after it, and for more than the longest gap of the train, is more of it. And a train that
@@ -236,14 +245,12 @@ def _over(found: Sequence[Passage], within: tuple[float, float], head: Partial) 
         within: the event (s).
         head: what its beginning tells, whole trains among the rest.
     """
-    if not found or not found[-1].confirmed:
+    if not found or not found[-1].known:
         return False
     train = found[-1]
-    core = strong_interval(train.traces[0], train.band[1] - train.band[0], within, CORE)
-    if not train.known or core is None:
-        return True
     best, motion = train.hypotheses[0], train.hypotheses[0].fit.motion
-    ahead, behind = motion.distance_at(np.array(core)) - best.places[[0, -1]]
+    core = strong_interval(train.traces[0], train.band[1] - train.band[0], within, CORE)
+    ahead, behind = motion.distance_at(np.array(core or train.interval)) - best.places[[0, -1]]
     if behind - max(0.0, -ahead) > np.max(np.diff(best.places)):
         return False
     sigma = np.hypot(head.sigma, motion.speed_sigma(best.mid_time))
