@@ -125,3 +125,47 @@ def test_trains_that_differ_by_centimetres_are_told_apart_as_surely_as_is_said()
 def test_places_of_no_train_agree_with_nothing(places):
     given, motion = wave(30.0, 0.0, 0.1, 0)
     assert agreement([given], motion, [places]).log == 0.0
+
+
+def heard(speed, seed, axles=AXLES):
+    """Every wheelset on the same rough rail: the same waveform again and again, 0.2 to 1 m long."""
+    rng = np.random.default_rng(seed)
+    motion = Motion(4.0, 0.0, speed, 0.0, np.eye(3))
+    time = np.arange(0.0, 8.0 + 1.3 * AXLES[-1] / speed, 1 / RATE)
+    near = np.arange(-3.0, 3.0, 0.02)
+    rough = signal.sosfilt(
+        signal.butter(2, [6.0, 30.0], "bandpass", fs=2 * np.pi / 0.02, output="sos"),
+        rng.standard_normal(near.size),
+    )
+    rough *= np.exp(-np.abs(near)) / np.std(rough)
+    x = motion.distance_at(time)[:, None] - axles
+    bent = np.exp(-np.abs(x)) * (np.cos(x) - np.sin(np.abs(x)))
+    value = np.sum(3 * np.interp(x, near, rough, 0.0, 0.0) + bent, axis=1)
+    return time, value + 0.3 * rng.standard_normal(time.size), motion
+
+
+TWIN = Catalogue.default()["CRH2"].axles * AXLES[-1] / Catalogue.default()["CRH2"].axles[-1]
+
+
+@pytest.mark.parametrize("low", [1.0, 0.4])
+def test_clipped_samples_still_tell_trains_that_differ_by_centimetres(low):
+    """Zero crossings stay where they are (Van Vleck & Middleton, Proc. IEEE 54, 1966)."""
+    for seed in range(8):
+        kinds = (AXLES, TWIN) if seed % 2 else (TWIN, AXLES)
+        time, value, motion = heard(30.0 + 7.0 * seed, seed, kinds[0])
+        top = 0.2 * np.max(np.abs(value))
+        cut = Wave(time, np.clip(value, -low * top, top), np.ones(time.size, dtype=bool), True)
+        right, wrong = (agreement([cut], motion, [places]).log for places in kinds)
+        assert right > max(wrong, 0.0) + 10.0
+
+
+def test_wheelsets_in_a_hole_do_not_count_against_a_train():
+    """A third of the train is missing."""
+    for seed in range(6):
+        time, value, motion = heard(50.0, 50 + seed)
+        measured = np.ones(time.size, dtype=bool)
+        for start in np.random.default_rng(seed).uniform(4.0, 8.0, 15):
+            measured &= (time < start) | (time > start + 0.12)
+        holed = Wave(time, np.where(measured, value, 5.0), measured)
+        right, wrong = (agreement([holed], motion, [places]).log for places in (AXLES, TWIN))
+        assert right > max(wrong, 0.0) + 10.0

@@ -163,8 +163,8 @@ def _model(
     speed: float,
     effects: Sequence[Array],
     seen: NDArray[np.bool_],
-) -> tuple[float, Motion, Array]:
-    """Log evidence against wheelsets anywhere, the motion, and the mean of every effect.
+) -> tuple[float, Motion]:
+    """Log evidence against wheelsets anywhere, and the motion.
 
     Args:
         candidate: the type.
@@ -200,7 +200,7 @@ def _model(
         start.acceleration + float(change[2]),
         np.linalg.inv(normal),
     )
-    return log, motion, np.asarray(z.T @ (solved[:, 3] - solved[:, :3] @ change))
+    return log, motion
 
 
 def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float) -> float:
@@ -209,8 +209,7 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
     All is scaled to one common speed (m/s), that types of one shape but another size are asked
     about the same waves.
     """
-    # clipping couples neighbours: two wheelsets of a bogie are no longer twice one pulse
-    if not candidate.waves or any(wave.clipped for wave in candidate.waves):
+    if not candidate.waves:
         return 0.0
     fit = candidate.fit
     own = float(motion.speed_at(motion.time_at(0.5 * places[-1])))
@@ -296,27 +295,20 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             effect = np.zeros((channels, axles))
             effect[k] = _CLOCK_S * abs(c.fit.motion.speed)
             trials.append(("clock", k, float(np.log(PRIOR_CLOCK)), [effect]))
-        as_listed: float | None = None
+        phase: float | None = None
         for kind, channel, log_prior, more in trials:
-            log, motion, mean = _model(c, noise, speed, [*base, *more], use)
+            log, motion = _model(c, noise, speed, [*base, *more], use)
             if motion.speed <= 0:
                 continue
-            if kind in spread:
-                bend = (spread[kind] * mean[len(base) :]) @ differs
-                phase = _in_phase(c, motion, c.places + bend, speed)
-            else:
-                # a wrong clock moves a channel as a whole, which the pulse takes up
-                if as_listed is None:
-                    as_listed = _in_phase(c, motion, c.places, speed)
-                phase = as_listed
+            # a wrong clock moves a channel as a whole, which the pulse takes up; what relatives
+            # have for places is not good enough to be asked for their phase
+            if phase is None:
+                phase = _in_phase(c, motion, c.places, speed)
             found.append((log + prior + log_prior, phase, index, kind, channel, motion))
     if not found:
         return []
-    # trains are built with tolerances, which show: waveforms choose among listed types only
-    best_phase = max((f[1] for f in found if f[3] in ("type", "clock")), default=0.0)
     # wheelsets that only rattle have no pulse below 100 Hz: then noise explains the waveforms
-    phases = [best_phase if f[3] in ("scaled", "varied") else f[1] for f in found]
-    logs = np.array([f[0] for f in found]) + np.logaddexp(0.0, phases)
+    logs = np.array([f[0] for f in found]) + np.logaddexp(0.0, [f[1] for f in found])
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     out = [

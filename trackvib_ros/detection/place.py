@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.special import expit
 
 from .kinematics import Motion
 
@@ -39,8 +40,14 @@ _COUPLINGS = np.arange(0.0, 3.01, 0.5)  # Hz, edges of the AC coupling of accele
 _REACH = 1.3  # m
 _SHIFTS = np.arange(-_REACH, _REACH + 0.01, 0.02)
 _SAMPLES = 2.5  # per wavelength at least
-_PULSE = np.arange(-2.0, 2.01, 0.5)  # m about a wheelset; as dense as the shortest wave asks for
-_BANDS, _ROUNDS = 8, 5
+_BAND = 0.5  # rad/m, of one level of noise
+_LINES = 2.0  # shape of the distribution of its variance; heavy tails, with a mean
+_LEVEL_ROUNDS = 8
+_FINE_STEP = 0.05  # m, for the shortest of these waves
+# rad/m; a wheel does not follow waves shorter than 0.2 m at speed
+_GROUPS = ((1.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0), (25.0, 30.0))
+_PULSE = np.arange(-2.0, 2.01, 1.0)  # m about a wheelset; as dense as the width of a group asks for
+_ROUNDS = 2
 _CHANGE = 0.3  # m, within which the motion is known already
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
@@ -68,10 +75,12 @@ class Wave:
     clipped: bool = False
 
 
-def _against_distance(wave: Wave, motion: Motion, length: float) -> tuple[Array, float] | None:
+def _against_distance(
+    wave: Wave, motion: Motion, length: float, step: float
+) -> tuple[Array, float] | None:
     """Mean value per cell of distance from ``-_TAPER`` on, tapered, and the measured fraction."""
-    count = int(np.ceil((length + 2 * _TAPER) / _STEP))
-    edges: Array = -_TAPER + _STEP * np.arange(count + 1, dtype=np.float64)
+    count = int(np.ceil((length + 2 * _TAPER) / step))
+    edges: Array = -_TAPER + step * np.arange(count + 1, dtype=np.float64)
     times = motion.time_at(edges)
     first, last = np.searchsorted(wave.time, [times[0], times[-1]])
     first, last = max(int(first) - 1, 0), int(last) + 1
@@ -83,7 +92,7 @@ def _against_distance(wave: Wave, motion: Motion, length: float) -> tuple[Array,
     total = np.concatenate([[0.0], np.cumsum(0.5 * (value[1:] + value[:-1]) * np.diff(time))])
     # mean over the cell's time: to first order that over its distance
     cell = np.diff(np.interp(times, time, total)) / np.maximum(np.diff(times), 1e-9)
-    ramp = np.minimum(1.0, (np.arange(count) + 0.5) * _STEP / _TAPER)
+    ramp = np.minimum(1.0, (np.arange(count) + 0.5) * step / _TAPER)
     taper = np.sin(0.5 * np.pi * ramp) ** 2
     taper *= taper[::-1]
     return (cell - np.sum(cell * taper) / taper.sum()) * taper, float(valid.mean())
@@ -139,63 +148,145 @@ class Agreement:
     covariance: Array
 
 
+@dataclass
+class _Group:
+    """Neighbouring wavenumbers of a channel.
+
+    Attributes:
+        first, step: wavenumbers (rad/m).
+        seen: transform of the waveform there.
+        share: independent wavenumbers per wavenumber.
+        at: places of the wheelsets (m).
+        shown: part of every wheelset that was measured.
+        log: likelihood of the pulse against noise.
+    """
+
+    first: float
+    step: float
+    seen: Any
+    share: float
+    at: Array
+    shown: Array
+    log: float = 0.0
+
+    def __post_init__(self) -> None:
+        bands = max(1, round(self.seen.size * self.step / _BAND))
+        self._band = np.arange(self.seen.size) * bands // self.seen.size
+        self._alone, self._weight = self._noise(self.seen)
+
+    def explained(self, change: Array) -> tuple[Array, Array]:
+        """What the waveform says of a change (m): normal matrix and right-hand side.
+
+        The pulse that fits best sets the weights and the likelihood.
+        """
+        along = 2 * (self.at - self.at[0]) / (self.at[-1] - self.at[0]) - 1
+        bend = np.stack([np.ones_like(along), along, 0.5 * along**2])
+        ahead = self.at - self.at[0] + change @ bend[1:]
+        k, phases = _phases(self.first, self.step, self.seen.size, ahead)
+        comb, *slopes = (self.shown * bend) @ phases
+        pulse = np.exp(-1j * np.outer(_PULSE, k))
+        taps = pulse * comb
+        left, pulled = self._reduced(taps, self.seen[None])
+        level, self._weight = self._noise(left[0])
+        # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
+        self.log = level - self._alone - _PULSE.size * float(np.log(2 * self.share * k.size))
+        slope = (pulled[0] @ pulse) * -1j * k * np.array(slopes)
+        slope, _ = self._reduced(taps, slope)
+        # the second derivative of the likelihood: the weight less by how it falls with the rest
+        bent = self._weight * (
+            1 - self._weight * np.abs(left[0]) ** 2 / (2 * self.share * (_LINES + 1))
+        )
+        normal = np.real((slope * bent).conj() @ slope.T)
+        return normal, np.real((slope * self._weight).conj() @ left[0])
+
+    def _noise(self, rest: Any) -> tuple[float, Array]:
+        """Log likelihood of what would be noise, and the weight of every wavenumber.
+
+        Noise has a level in every band and lines (a rail's resonance, every fastening that a wheel
+        passes): a normal distribution whose variance is inverse gamma distributed about the level.
+        """
+        power = np.abs(rest) ** 2
+        count = np.bincount(self._band)
+        least = _LEAST * float(np.mean(np.abs(self.seen) ** 2)) + 1e-300
+        level = np.bincount(self._band, power) / count + least
+        for _ in range(_LEVEL_ROUNDS):
+            own = level[self._band]
+            weight = (_LINES + 1) / (_LINES * own + power)
+            level = level * np.bincount(self._band, weight * power) / count + least
+        own = level[self._band]
+        log = -np.log(own) - (_LINES + 1) * np.log1p(power / (_LINES * own))
+        return self.share * float(log.sum()), 2 * self.share * (_LINES + 1) / (_LINES * own + power)
+
+    def _reduced(self, taps: Any, rows: Any) -> tuple[Any, Any]:
+        """Rows less what of them pulses explain, and these pulses."""
+        weighted = taps.conj() * self._weight
+        normal = weighted @ taps.T
+        normal += 1e-9 * np.trace(normal).real * np.eye(len(taps))
+        shape = np.linalg.solve(normal, weighted @ rows.T).T
+        return rows - shape @ taps, shape
+
+
+def _phases(first: float, step: float, count: int, at: Array) -> tuple[Array, Any]:
+    """Equidistant wavenumbers (rad/m) and exp(-i k at), shape (places, wavenumbers)."""
+    fine = int(np.sqrt(count)) + 1
+    coarse = np.exp(-1j * np.multiply.outer(at, first + step * fine * np.arange(fine)))
+    phases = (
+        coarse[:, :, None] * np.exp(-1j * np.multiply.outer(at, step * np.arange(fine)))[:, None]
+    )
+    k = np.asarray(first + step * np.arange(count), dtype=np.float64)
+    return k, phases.reshape(at.size, -1)[:, :count]
+
+
 def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) -> Agreement:
     """Whether the distances between the wheelsets of a train are right.
 
-    Noise has an unknown level in every band of wavenumbers, for a bridge answers to some. The
-    pulse, real and within 2 m of its wheelset, and a change of the motion are fitted by least
-    squares weighted accordingly (Gauss-Newton): with the part q of a band's energy that is left of
-    n independent wavenumbers the likelihood is the product of q^-n. Coupling, foundation, layer
-    and a place of the channel that is off by less are in the pulse.
+    A sensor hears every wheelset on the same rail: what the roughness there makes one do comes
+    again with the next, not the deflection alone. Clipping spares the phase of such waves, for zero
+    crossings stay where they are. In every group of bands of wavenumbers a pulse within 2 m of its
+    wheelset is fitted by least squares, weighted by the noise it leaves, whose level is unknown in
+    every band, for a bridge answers to some. A group shows a pulse or only noise, with even odds.
+    The change of the motion follows from the long waves, whose phase is not in doubt, to shorter
+    ones (Newton). Coupling, foundation, layer and a place of the channel that is off are in the
+    pulse; wheelsets that pass in a hole of the record have less of one.
 
     Args:
         waves: per channel.
         motion: of the train.
         places: of its wheelsets (m), per channel, as for :func:`likelihood`.
     """
-    spectra = [
-        (found, at)
-        for w, at in zip(waves, places, strict=True)
-        if (found := spectrum(w, motion, at))
-    ]
-    change, covariance, log = np.zeros(2), np.diag([_CHANGE**2] * 2), 0.0
-    if not spectra:
-        return Agreement(log, change, covariance)
-    weights = [np.ones(k.size) for (k, _, _), _ in spectra]
-    for round_ in range(_ROUNDS):
-        information, right = np.diag([_CHANGE**-2] * 2), -change / _CHANGE**2
-        # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
-        log = -0.5 * _PULSE.size * sum(float(np.log(2 * n)) for (_, _, n), _ in spectra)
-        for c, ((k, seen, independent), at) in enumerate(spectra):
-            along = 2 * (at - at[0]) / (at[-1] - at[0]) - 1
-            bend = np.stack([along, 0.5 * along**2])
-            phases = np.exp(-1j * np.outer(k, at - at[0] + change @ bend))
-            pulse = np.exp(-1j * np.outer(_PULSE, k))
-            taps = pulse * phases.sum(axis=1)
-            weight = weights[c]
-            normal = np.real((taps.conj() * weight) @ taps.T)
-            normal += 1e-9 * np.trace(normal) * np.eye(_PULSE.size)
-            shape = np.linalg.solve(normal, np.real((taps.conj() * weight) @ seen))
-            rest = seen - shape @ taps
-            for band in np.array_split(np.arange(k.size), _BANDS):
-                energy = max(float(np.sum(np.abs(seen[band]) ** 2)), 1e-300)
-                left = max(float(np.sum(np.abs(rest[band]) ** 2)), _LEAST * energy)
-                count = independent * band.size / k.size
-                log += count * float(np.log(energy / left))
-                weight[band] = 2 * count / left
-            slope = (shape @ pulse) * -1j * k * (bend @ phases.T)
-            cross = np.real((taps.conj() * weight) @ slope.T)
-            normal = np.real((taps.conj() * weight) @ taps.T)
-            normal += 1e-9 * np.trace(normal) * np.eye(_PULSE.size)
-            pulled = np.linalg.solve(
-                normal, np.column_stack([cross, np.real((taps.conj() * weight) @ rest)])
-            )
-            information += np.real((slope.conj() * weight) @ slope.T) - cross.T @ pulled[:, :2]
-            right += np.real((slope.conj() * weight) @ rest) - cross.T @ pulled[:, 2]
-        covariance = np.linalg.inv(information)
-        if round_ < _ROUNDS - 1:
-            change = change + np.clip(covariance @ right, -_CHANGE, _CHANGE)
-    return Agreement(log, change, covariance)
+    stages: list[list[_Group]] = [[] for _ in _GROUPS]
+    for wave, at in zip(waves, places, strict=True):
+        found = spectrum(wave, motion, at, _GROUPS[-1][1], _FINE_STEP)
+        if found is None:
+            continue
+        k, seen, independent = found
+        step = float(k[1] - k[0])
+        shown = _shown(wave, motion, at)
+        for stage, (low, high) in zip(stages, _GROUPS, strict=True):
+            part = slice(*(int(i) for i in np.searchsorted(k, [low, high])))
+            if (part.stop - part.start) * step > 0.5 * (high - low):
+                share = independent / k.size
+                stage.append(_Group(float(k[part.start]), step, seen[part], share, at, shown))
+    change, normal, right = np.zeros(2), np.diag([_CHANGE**-2] * 2), np.zeros(2)
+    asked: list[_Group] = []
+    for stage, (_, high) in zip(stages, _GROUPS, strict=True):
+        before = normal, right
+        for _ in range(_ROUNDS if stage else 0):
+            normal, right = before
+            for group in stage:
+                more, pull = group.explained(change)
+                normal = normal + expit(group.log) * more
+                right = right + expit(group.log) * (pull + more @ change)
+            more_change = np.linalg.solve(normal, right) - change
+            change = change + np.clip(more_change, -1 / high, 1 / high)
+        asked += stage
+        # where longer waves show no train, the phase of shorter ones is anybody's guess
+        if asked and all(group.log < 0 for group in asked):
+            break
+    for group in asked:
+        group.explained(change)
+    log = sum(float(np.logaddexp(0.0, group.log)) - float(np.log(2)) for group in asked)
+    return Agreement(log, change, np.linalg.inv(normal))
 
 
 def _mid_speed(motion: Motion, places: Array) -> float:
@@ -203,7 +294,7 @@ def _mid_speed(motion: Motion, places: Array) -> float:
 
 
 def spectrum(
-    wave: Wave, motion: Motion, places: Array, top: float | None = None
+    wave: Wave, motion: Motion, places: Array, top: float | None = None, step: float = _STEP
 ) -> tuple[Array, Any, float] | None:
     """Wavenumbers (rad/m) about those of the deflection, the transform of the waveform there with
     distances from the first wheelset on, and how many of them are independent.
@@ -211,27 +302,35 @@ def spectrum(
     Args:
         wave, motion, places: as for :func:`likelihood`.
         top: largest wavenumber (rad/m) instead of that of a deflection.
+        step: cell of distance (m).
     """
     start, length = float(places[0]), float(places[-1] - places[0])
     if not (np.isfinite(length) and length > 0 and _mid_speed(motion, places) > 0):
         return None
-    found = _against_distance(wave, _from(motion, start), length)
+    found = _against_distance(wave, _from(motion, start), length, step)
     if found is None:
         return None
     cells, measured = found
     size = fft.next_fast_len(4 * cells.size // 3, real=True)
-    k = 2 * np.pi * fft.rfftfreq(size, _STEP)
+    k = 2 * np.pi * fft.rfftfreq(size, step)
     spacing = float(np.median(np.diff(wave.time)))
     top = min(top or _WAVENUMBERS[1], 2 * np.pi / (_SAMPLES * spacing * _mid_speed(motion, places)))
     use = (k >= _WAVENUMBERS[0]) & (k <= top)
     if use.sum() < 8:
         return None
     k = k[use]
-    origin = -_TAPER + 0.5 * _STEP
+    origin = -_TAPER + 0.5 * step
     seen = fft.rfft(cells, size)[use] * np.exp(-1j * k * origin)
     if not np.any(seen):
         return None
-    return k, seen, cells.size * _STEP * (k[-1] - k[0]) / (2 * np.pi) * measured
+    return k, seen, cells.size * step * (k[-1] - k[0]) / (2 * np.pi) * measured
+
+
+def _shown(wave: Wave, motion: Motion, places: Array) -> Array:
+    """Measured part of the metre on either side of every wheelset."""
+    total = np.concatenate([[0.0], np.cumsum(wave.valid)])
+    ends = np.searchsorted(wave.time, motion.time_at(np.stack([places - 1.0, places + 1.0])))
+    return np.asarray((total[ends[1]] - total[ends[0]]) / np.maximum(ends[1] - ends[0], 1))
 
 
 def _from(motion: Motion, start: float) -> Motion:
