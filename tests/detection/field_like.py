@@ -570,9 +570,10 @@ def judge(s: StandIn, known: Catalogue | None = None) -> dict[str, Any]:
         "score": v["score"],
         "speed": speed.value / s.mid_speed(x) - 1,
         "sigma": speed.sigma / s.mid_speed(x),
-        "departure": v["departure_ns"] * 1e-9 - times[-1],
         "direction": {"forward": 1, "backward": -1, "unknown": 0}[v["direction"]] * s.direction,
     }
+    if "departure_ns" in v:
+        result["departure"] = v["departure_ns"] * 1e-9 - times[-1]
     if "axle_count" in v:
         result |= {
             "count": v["axle_count"] - times.size,

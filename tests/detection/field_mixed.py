@@ -130,7 +130,9 @@ def judge(seed: int) -> dict[str, Any]:
 def _overlap(t: StandIn, e: TrainEvent, zero: float) -> float:
     first = min(float(t.axle_times(c.x)[0]) for c in t.channels)
     last = max(float(t.axle_times(c.x)[-1]) for c in t.channels)
-    begin, end = e.stamp_ns * 1e-9 - zero, e.values["departure_ns"] * 1e-9 - zero
+    begin, end = e.stamp_ns * 1e-9 - zero, last
+    if "departure_ns" in e.values:  # else the record ends before
+        end = e.values["departure_ns"] * 1e-9 - zero
     return (min(last, end) - max(first, begin)) / max(end - begin, 1e-3)
 
 
@@ -148,11 +150,14 @@ def _compare(t: StandIn, e: TrainEvent, zero: float) -> dict[str, Any]:
         "flags": list(e.quality),
         "speed": speed.value / truth - 1,
         "sigma": speed.sigma / truth,
-        "departure": v["departure_ns"] * 1e-9 - zero - times[-1],
-        "departure_sigma": v["departure_sigma"],
         "direction": way * t.direction,
         "score": v["score"],
     }
+    if "departure_ns" in v:
+        row |= {
+            "departure": v["departure_ns"] * 1e-9 - zero - times[-1],
+            "departure_sigma": v["departure_sigma"],
+        }
     if "axle_count" in v:
         row |= {
             "count": v["axle_count"] - times.size,

@@ -9,6 +9,7 @@ from solver import InputError
 from tests.detection.field_like import StandIn, catalogue, stand_in
 from tests.detection.stand_ins import SEEDS
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, TrainDetector, detect
+from trackvib_ros.detection.arrays import _grid
 from trackvib_ros.detection.features import GroupStream, bands_for
 from trackvib_ros.detection.onset import quietest
 from trackvib_ros.nuisances import RATE, nuisance
@@ -102,6 +103,24 @@ def test_times_rounded_in_a_file(passage_of_class_425, digits):
     s = passage_of_class_425
     # at 2048 Hz every second pair of stamps is equal when rounded to ms; the grid is their mean
     check(s, detect(np.round(s.time, digits), s.samples, s.channels, KNOWN))
+
+
+@pytest.mark.parametrize("size", [5, 20])
+def test_blocks_of_samples_that_share_a_time(passage_of_class_425, size):
+    s = passage_of_class_425
+    check(s, detect(s.time[np.arange(len(s.samples)) // size * size], s.samples, s.channels, KNOWN))
+
+
+@pytest.mark.parametrize("size", [1, 2.05, 5, 64])
+def test_a_gap_is_found_whatever_the_clock_shows(size):
+    step = 1 / 2048
+    time = np.arange(4000) * step
+    time[1920:] += 0.5
+    step_ns, pieces, stamps = _grid(np.floor(time / (size * step) + 1e-6) * size * step)
+    assert len(pieces) == 2
+    # a cut lies between two times; what is rounded is known to a block of samples
+    assert abs(pieces[1][0] - 1920) < size and abs(stamps[1] * 1e-9 - time[1920]) < size * step
+    assert step_ns * 1e-9 == pytest.approx(step, rel=2 * size / 1900)
 
 
 @pytest.mark.parametrize("kind", [np.int16, np.float32, np.int64])

@@ -154,24 +154,31 @@ def _to_one(column: Array, known: NDArray[np.bool_]) -> Array:
 def _grid(clock: Array) -> tuple[int, list[tuple[int, int]], NDArray[np.int64]]:
     """Step (ns) of the times of samples (s), pieces without a gap, and their stamps (ns).
 
-    Times may be rounded or jitter: the step is the mean over pieces.
+    Times may be rounded, jitter, or be those of blocks of samples: the step is the mean over
+    pieces, and a gap is what is longer than the samples with the time before it take.
     """
-    steps = np.diff(clock)
     if clock[-1] <= clock[0]:
         raise InputError("time must increase from sample to sample (s)")
-    span = min(_DENSE, len(steps))
+    span = min(_DENSE, len(clock) - 1)
     typical = float(np.median(clock[span:] - clock[:-span])) / span
     if typical <= 0:
-        raise InputError("time must increase from sample to sample (s)")
-    jitter = float(np.median(np.abs(steps - typical)))
-    gap = np.abs(steps - typical) > 0.5 * typical + _JITTER * jitter
-    mean = float(np.mean(steps[~gap])) if not gap.all() else typical
+        raise InputError(
+            f"time is the same for {span} samples and more, too coarse for their rate; give the "
+            "rate (Hz), or times (s) of a finer clock"
+        )
+    starts = np.flatnonzero(np.diff(clock, prepend=-np.inf) > 0)
+    steps, counts = np.diff(clock[starts]), np.diff(starts)
+    off = np.abs(steps - typical * counts)
+    # where times repeat, samples are known to as many as share one
+    least = 0.5 + (float(np.median(counts)) if starts.size < clock.size else 0.0)
+    gap = off > least * typical + _JITTER * float(np.median(off))
+    mean = float(np.sum(steps[~gap]) / np.sum(counts[~gap])) if not gap.all() else typical
     if not 50 <= 1 / mean <= 1e6:
         raise InputError(
             f"time has steps of {mean:.6g}, a rate of {1 / mean:.6g} Hz; it must be in s, at 50 Hz "
             "to 1 MHz"
         )
-    cuts = [0, *(int(c) + 1 for c in np.flatnonzero(gap)), len(clock)]
+    cuts = [0, *(int(c) for c in starts[1:][gap]), len(clock)]
     pieces = list(pairwise(cuts))
     stamps = np.round(clock[[first for first, _ in pieces]] * 1e9).astype(np.int64)
     return max(1, round(1e9 * mean)), pieces, stamps
