@@ -238,7 +238,7 @@ def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial
 
     What the rail carries is heard before the first wheelset as after the last: what is strong for
     longer after it, and for more than the longest gap of the train, is more of it. And a train that
-    goes on can look like a shorter one that is faster.
+    goes on can look like a shorter one that is faster, if delays do not tell the speed.
 
     Args:
         found: trains.
@@ -253,5 +253,7 @@ def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial
     ahead, behind = motion.distance_at(np.array(core or train.interval)) - best.places[[0, -1]]
     if behind - max(0.0, -ahead) > np.max(np.diff(best.places)):
         return False
+    if head.direction == 0:
+        return True  # on one channel the whole train is the better pattern: it ends
     sigma = np.hypot(head.sigma, motion.speed_sigma(best.mid_time))
     return bool(abs(head.speed - motion.speed_at(best.mid_time)) < _APART * sigma)
