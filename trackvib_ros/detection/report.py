@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from . import stated
 from .blind import CONFIDENT, Blind
 from .catalogue import Catalogue, TrainType
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
@@ -22,10 +23,7 @@ from .unlisted import CAR
 Array = NDArray[np.float64]
 
 _UNITS = {1: "single", 2: "double"}
-_GEOMETRY = 0.03  # m, wheelsets of a train against its type
-_WHEELBASE = 0.1  # m, half of what wheelbases differ by: that of an unknown type is not measured
 _PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
-_SIZE = 0.14  # ln of car lengths from 17 to 27.5 m, equally likely: 0.48 / sqrt 12
 _MARGIN_S = 0.15  # of a record about the strong energy of a train that is wholly on it
 _MARGIN = 0.5  # m, the same about its wheelsets if these are known
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
@@ -214,39 +212,6 @@ def _prefer_blind(passage: Passage, blind: Blind) -> bool:
     return blind.regular >= 0.9 and blind.direction != 0 and blind.times.size != pattern
 
 
-def _speed(passage: Passage) -> tuple[float, float, float, tuple[float, float]]:
-    """Speed at mid-train (m/s), its sigma under the best explanation and over all, 95 % interval.
-
-    The interval leaves out what is less likely than one in twenty, and the sigma is that of the
-    interval. With one channel and no deflection that shows the type, the sigma contains the small
-    chance that the train is a relative of it, some percent larger or smaller.
-    """
-    best = passage.hypotheses[0]
-    when = best.mid_time
-    parts, relatives = [], []
-    for e in passage.explanations:
-        part = (e.probability, float(e.motion.speed_at(when)), e.motion.speed_sigma(when))
-        if e.kind != "clock":
-            parts.append(part)
-        if e.kind in ("scaled", "varied"):
-            relatives.append(part)
-    own = best.fit.motion.speed_sigma(when)
-    speed = float(best.fit.motion.speed_at(when))
-    if not passage.known:
-        speed = sum(w * v for w, v, _ in relatives) / sum(w for w, _, _ in relatives)
-        if (
-            len(passage.traces) == 1
-        ):  # nothing fixes the size of what the listed types only resemble
-            parts = [(w, v, float(np.hypot(s, _SIZE * v))) for w, v, s in parts]
-    total = sum(w for w, _, _ in parts)
-    variance = sum(w * ((v - speed) ** 2 + s**2) for w, v, s in parts) / total
-    half = max(half_interval(parts, speed), 1.96 * own)
-    # the delay between two channels bounds the size of an unlisted train; one channel cannot
-    shown = len(passage.traces) > 1 or (passage.known and best.phase > 0)
-    sigma = half / 1.96 if shown else max(variance**0.5, own)
-    return speed, own, sigma, (speed - half, speed + half)
-
-
 def families(hypotheses: Sequence[Hypothesis]) -> tuple[tuple[str, float], ...]:
     """Families with their summed probabilities, most probable first."""
     total: dict[str, float] = {}
@@ -273,32 +238,13 @@ def _train(
     def stamp(time: float) -> int:
         return origin_ns + round(time * 1e9)
 
-    # of the variance of a wheelset about its place the train itself has an unknown share, none to
-    # all that its tolerance allows; with half the largest share trusted the error has the variance
-    # trust (1 - trust) scale² on average, at a largest share of one whatever the true one is
-    trust = 0.5 * min(1.0, (_GEOMETRY / fit.scale) ** 2) if passage.known else 1.0
-    predicted = motion.time_at(places)
-    if passage.known:
-        late = -fit.residual[0] / np.maximum(motion.speed_at(predicted), 0.5)
-        # the channel's own place is in the motion already
-        late -= np.median(late[fit.used[0]]) if fit.used[0].any() else 0.0
-    else:
-        late = fit.time[0] - predicted
-    axle_times = predicted + np.where(fit.used[0], trust * late, 0.0)
-    scatter = float(np.sqrt(trust * (1 - trust)) * fit.scale) if passage.known else fit.scale
-    # under an unknown type: where its pulse is, whatever the size of the train
-    direct = float(np.sqrt(fit.place_sigma[0] ** 2 + fit.scale**2 + _WHEELBASE**2))
+    axle_times, axle_sigmas = stated.wheelsets(passage)
     events: list[TrainEvent] = []
     reference = passage.traces[0]
     confidences = []
     for i in range(places.size):
         seen = bool(fit.used[0, i])
         time = float(axle_times[i])
-        speed_here = max(float(motion.speed_at(time)), 0.5)
-        if passage.known or not seen:
-            time_sigma = float(np.hypot(motion.time_sigma(time), scatter / speed_here))
-        else:
-            time_sigma = direct / speed_here
         clear = 1 / (1 + np.exp(-3 * (float(fit.contrast[0, i]) - 0.5)))
         confidence = best.score * (clear if seen else 0.3)
         confidences.append(confidence)
@@ -306,7 +252,7 @@ def _train(
             TrainEvent(
                 kind="axle",
                 stamp_ns=stamp(time),
-                sigma_s=time_sigma,
+                sigma_s=float(axle_sigmas[i]),
                 confidence=float(np.clip(confidence, 0.01, 0.99)),
                 method="pulse shift by maximum likelihood" if seen else "predicted by the motion",
                 sensors=(reference.name,),
@@ -314,24 +260,20 @@ def _train(
             )
         )
     known = passage.known
-    speed, own, sigma, interval = _speed(passage)
-    first, last = float(motion.time_at(places[0])), float(motion.time_at(places[-1]))
-    first_sigma, last_sigma = motion.time_sigma(first), motion.time_sigma(last)
+    found = stated.speed(passage)
+    speed, sigma = found.value, found.sigma
+    first, last = stated.ends(passage, speed)
     if not known:
         quality = [*quality, "unknown_type"]
-        if fit.observed[0, 0]:
-            first, first_sigma = float(fit.time[0, 0]), direct / speed
-        if fit.observed[0, -1]:
-            last, last_sigma = float(fit.time[0, -1]), direct / speed
     passing_sigma = 2**0.5 * fit.scale / speed
     summary = Summary(
         sensors=names,
         x=reference.x,
-        arrival=(first, first_sigma),
-        departure=(last, last_sigma),
+        arrival=first,
+        departure=last,
         passing_sigma=passing_sigma,
         speed=(speed, sigma),
-        interval=interval,
+        interval=found.interval,
         acceleration=(motion.acceleration, motion.acceleration_sigma),
         direction=passage.direction,
         method=method,
@@ -349,12 +291,13 @@ def _train(
             if h.probability > 1e-3
         ),
         "score": round(best.score, 4),
-        "speed_template": Estimate(float(motion.speed_at(best.mid_time)), own, "m/s"),
+        "speed_template": Estimate(*found.template, "m/s"),
     }
     if known:
+        values["speed_of"] = found.types
         duration = summary.duration
         values |= _identity(train, best.reverse) | {
-            "train_length": Estimate(train.length, train.length * sigma / speed, "m"),
+            "train_length": Estimate(train.length, train.length * found.template_sigma, "m"),
             "speed_passing_time": Estimate(
                 train.span / duration, train.span / duration**2 * passing_sigma, "m/s"
             ),
