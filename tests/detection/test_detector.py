@@ -71,7 +71,10 @@ def test_passage_on_the_demo_sensors(name, kmh, acceleration, direction, snr, ki
     assert values["units"] == ("double" if train.units == 2 else "single")
     # targets of the design: 0.4 % (p95, two sensors), 0.2 m/s², 5 and 8 ms
     speed = values["speed"]
-    assert speed.value == pytest.approx(truth.mid_speed(), rel=4e-3)
+    # the type is right; if another remains likely the speed told is between theirs
+    assert values["speed_template"].value == pytest.approx(truth.mid_speed(), rel=4e-3)
+    between = 9e-3 / 2 if len(values["speed_of"]) > 1 else 0.0
+    assert speed.value == pytest.approx(truth.mid_speed(), rel=max(4e-3, between))
     assert speed.sigma > 0 and speed.unit == "m/s"
     assert values["acceleration"].value == pytest.approx(acceleration, abs=0.2)
     times = truth.axle_times(0.0)
