@@ -167,7 +167,12 @@ def test_ten_percent_missing_samples_cost_nothing():
         x[rng.random(x.size) < 0.1] = np.nan
         signals[name] = (rate, x)
     (passage,) = passages(run(signals, RAILS))
-    assert passage.values["speed"].value == pytest.approx(60.0, rel=4e-3)
+    # bursts without a deflection: CRH2, 0.9 % larger, may not be told from CRH3
+    speed = passage.values["speed"]
+    assert speed.value == pytest.approx(
+        60.0, rel=4e-3 if len(passage.values["speed_of"]) < 2 else 9e-3
+    )
+    assert abs(speed.value - 60.0) < 2 * speed.sigma
     assert passage.values["axle_count"] == 32
 
 
