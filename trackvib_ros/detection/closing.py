@@ -107,7 +107,8 @@ class Closing:
             rails = [r for r in records if r.channel.layer == "rail"]
             stop = (ended.now_ns - ended.origin_ns) * 1e-9
             head = arrived(rails, (within[0], stop), self._limits, self._heads)
-            if head is not None and not _passed(found, within, head):
+            # on one channel a beginning looks like that of other types at other speeds
+            if head is not None and head.direction and not _passed(found, within, head):
                 return report.truncated(self._catalogue, head, ended.origin_ns, ended.now_ns)
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
             away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
@@ -238,7 +239,7 @@ def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial
 
     What the rail carries is heard before the first wheelset as after the last: what is strong for
     longer after it, and for more than the longest gap of the train, is more of it. And a train that
-    goes on can look like a shorter one that is faster, if delays do not tell the speed.
+    goes on can look like a shorter one that is faster.
 
     Args:
         found: trains.
@@ -253,7 +254,5 @@ def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial
     ahead, behind = motion.distance_at(np.array(core or train.interval)) - best.places[[0, -1]]
     if behind - max(0.0, -ahead) > np.max(np.diff(best.places)):
         return False
-    if head.direction == 0:
-        return True  # on one channel the whole train is the better pattern: it ends
     sigma = np.hypot(head.sigma, motion.speed_sigma(best.mid_time))
     return bool(abs(head.speed - motion.speed_at(best.mid_time)) < _APART * sigma)

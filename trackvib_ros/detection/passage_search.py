@@ -66,8 +66,8 @@ def find_passage(
         return passage
     blind = describe(records, within, reference.interval, limits)
     blind = blind and at_site(blind, site)
-    if off and (passage.known or (blind is not None and blind.travels)):
-        # an unlisted train, or chance, is likelier than a pattern at one channel and a wrong clock
+    if blind is not None and blind.travels and off:
+        # an unlisted train is likelier than a pattern at either channel and a wrong clock
         return replace(
             passage,
             hypotheses=(),
@@ -76,6 +76,8 @@ def find_passage(
             quality=(),
             blind=blind,
         )
+    if passage.known:
+        return passage
     return replace(passage, blind=blind)
 
 
