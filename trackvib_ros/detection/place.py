@@ -48,6 +48,7 @@ _FINE_STEP = 0.05  # m, for the shortest of these waves
 _GROUPS = ((1.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0), (25.0, 30.0))
 _PULSE = np.arange(-2.0, 2.01, 1.0)  # m about a wheelset; as dense as the width of a group asks for
 _ROUNDS = 2
+_IN_DOUBT = 1.0  # rad, standard deviation of a phase that is within half a turn at three
 _CHANGE = 0.3  # m, within which the motion is known already
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
@@ -245,9 +246,9 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
     crossings stay where they are. In every group of bands of wavenumbers a pulse within 2 m of its
     wheelset is fitted by least squares, weighted by the noise it leaves, whose level is unknown in
     every band, for a bridge answers to some. A group shows a pulse or only noise, with even odds.
-    The change of the motion follows from the long waves, whose phase is not in doubt, to shorter
-    ones (Newton). Coupling, foundation, layer and a place of the channel that is off are in the
-    pulse; wheelsets that pass in a hole of the record have less of one.
+    The change of the motion follows from the long waves to shorter ones (Newton), as far as their
+    phase is not in doubt. Coupling, foundation, layer and a place of the channel that is off are
+    in the pulse; wheelsets that pass in a hole of the record have less of one.
 
     Args:
         waves: per channel.
@@ -270,6 +271,10 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
     change, normal, right = np.zeros(2), np.diag([_CHANGE**-2] * 2), np.zeros(2)
     asked: list[_Group] = []
     for stage, (_, high) in zip(stages, _GROUPS, strict=True):
+        ends = np.array([[1.0, 0.5], [-1.0, 0.5]])
+        doubt = high * float(np.sqrt(np.max(np.sum(ends @ np.linalg.inv(normal) * ends, axis=1))))
+        if asked and doubt > _IN_DOUBT:
+            break
         before = normal, right
         for _ in range(_ROUNDS if stage else 0):
             normal, right = before
@@ -280,9 +285,6 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
             more_change = np.linalg.solve(normal, right) - change
             change = change + np.clip(more_change, -1 / high, 1 / high)
         asked += stage
-        # where longer waves show no train, the phase of shorter ones is anybody's guess
-        if asked and all(group.log < 0 for group in asked):
-            break
     for group in asked:
         group.explained(change)
     log = sum(float(np.logaddexp(0.0, group.log)) - float(np.log(2)) for group in asked)
