@@ -24,12 +24,13 @@ Array = NDArray[np.float64]
 WINDOWS = (1, 2, 4, 8, 16)
 """Lengths of the short-term averages (frames)."""
 
-_UPPER = 3 * WINDOWS[-1] // 4 - 1  # rank of the upper quartile of the longest window
+_BLOW = 4  # frames, one more than the blow of a wheel flat touches: 2 ms, a filter's 10, an edge
 
 WARM_UP = 50
 """Frames from which a floor is learned."""
 
 _FALSE_ALARM = 1e-9  # per test, Gaussian noise: 0.007 an hour and channel before the margin
+_FALSE_LAST = 1e-4  # inside an event: noise lengthens one in 100 quiet times, of 100 tests each
 _WARM_UP_S = 0.5
 _UNLUCKY, _FEW = 1e-3, 10.0
 _MARGIN = 1.2  # the floor itself is an estimate
@@ -99,13 +100,15 @@ class Onset:
         np.minimum(statistic[-1], _MOST, out=self._sum)
 
 
-def thresholds(bands: tuple[tuple[float, float], ...], frame_s: float) -> Array:
+def thresholds(
+    bands: tuple[tuple[float, float], ...], frame_s: float, false_alarm: float = _FALSE_ALARM
+) -> Array:
     """Energy over floor of active frames, shape (windows, bands)."""
     table = np.empty((len(WINDOWS), len(bands)))
     for w, frames in enumerate(WINDOWS):
         for b, (low, high) in enumerate(bands):
             freedom = max(1.0, 2 * (high - low) * frames * frame_s)
-            table[w, b] = stats.chi2.isf(_FALSE_ALARM, freedom) / freedom
+            table[w, b] = stats.chi2.isf(false_alarm, freedom) / freedom
     return np.maximum(_MARGIN * table, _LEAST_RATIO) * margins(bands)
 
 
@@ -160,9 +163,10 @@ class Trigger:
         first_floor: the floor as it was first learned.
         recent: mean energy over the longest window.
         level: energy of the longest window over the floor, the largest of the bands.
-        steady: the same of its upper quartile of frames, which the blows of a wheel flat, a frame
-            or two each, do not raise.
-        active: energy over threshold in a window and band.
+        steady: the most that any four frames on end of it all have (an opening, in the terms of
+            morphology): the blows of wheel flats do not raise it, however strong they are.
+        active: energy over threshold in a window and band; the threshold is lower while the floor
+            is frozen, for an event that has begun lasts on less than makes one begin.
     """
 
     def __init__(
@@ -173,6 +177,7 @@ class Trigger:
         freedom: Array,
     ) -> None:
         self.thresholds = thresholds(bands, frame_s)
+        self._lasting = thresholds(bands, frame_s, _FALSE_LAST)
         shape = (channels, len(bands))
         self.floor = np.full(shape, np.nan)
         self.active = np.zeros(channels, dtype=bool)
@@ -226,11 +231,13 @@ class Trigger:
         total = np.cumsum(self._history, axis=0)[_LAST]
         mean = total / (_COUNT * self.floor)
         with np.errstate(invalid="ignore"):
-            above = (mean > self.thresholds[:, None]).any(axis=(0, 2))
+            least = self._lasting if frozen else self.thresholds
+            above = (mean > least[:, None]).any(axis=(0, 2))
         longest = mean[-1]
         self.level = np.nan_to_num(longest).max(axis=1, initial=0.0)
-        upper = np.partition(self._history, _UPPER, axis=0)[_UPPER] / self.floor
-        self.steady = np.nan_to_num(upper).max(axis=1, initial=0.0)
+        runs = range(WINDOWS[-1] - _BLOW + 1)
+        through = np.stack([self._history[i : i + _BLOW].min(axis=0) for i in runs])
+        self.steady = np.nan_to_num(through.max(axis=0) / self.floor).max(axis=1, initial=0.0)
         self.recent = longest * self.floor
         self.active = usable & ready & above
         learn = usable & ready & ~self.active
