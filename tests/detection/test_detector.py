@@ -231,6 +231,26 @@ def test_flat_wheels_far_above_the_wheelsets(kmh):
     assert right == 3
 
 
+@pytest.mark.parametrize("kmh", [110, 188])
+def test_an_event_lasts_as_long_as_its_wheelsets_whatever_blows_stand_above_them(kmh):
+    """Six flats 35 and 40 dB above the wheelsets, in the first half of the train only."""
+    truth = Passage(CATALOGUE["metro"].axles, kmh / 3.6, start=2.5 + 40 / kmh)
+    signals = record([truth], RAILS, 20, seed=1, rates={"rail": 2000})
+    for channel in RAILS:
+        rate, x = signals[channel.name]
+        time = np.arange(x.size) / rate
+        blows = flat_blows(truth, channel, time, rate, range(3, 9), 11000 / kmh)
+        signals[channel.name] = rate, x + blows
+    events = [run(signals, RAILS, length_s) for length_s in (0.02, 0.37)]
+    assert events[0] == events[1]
+    assert len(of(events[0], "arrival")) == len(of(events[0], "passage")) == 1
+    (passage,) = passages(events[0])
+    assert passage.values["type"] == "metro" and passage.values["axle_count"] == 24
+    times = truth.axle_times(0.0)
+    assert abs(passage.stamp_ns * 1e-9 - times[0]) < 0.5 / truth.speed
+    assert abs(passage.values["departure_ns"] * 1e-9 - times[-1]) < 0.5 / truth.speed
+
+
 @pytest.mark.parametrize("gap", [1.5, 3.0])
 def test_two_trains_in_succession(gap):
     first = Passage(CATALOGUE["metro"].axles, 70.0)

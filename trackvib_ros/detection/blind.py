@@ -87,6 +87,7 @@ def describe(
     within: tuple[float, float],
     interval: tuple[float, float],
     limits: tuple[float, float],
+    limited: bool = False,
 ) -> Blind | None:
     """What two rail channels tell of a train that no catalogue type explains.
 
@@ -95,9 +96,10 @@ def describe(
         within: the event (s).
         interval: first and last strong energy (s).
         limits: speeds (m/s).
+        limited: whether the blows of flats hide its wheelsets.
     """
     ordered = sorted(records, key=lambda r: r.channel.x)
-    blind = _two_channels(ordered[0], ordered[-1], within, limits)
+    blind = _two_channels(ordered[0], ordered[-1], within, limits, limited)
     if blind is None or blind.regular >= CONFIDENT:
         return blind
     return _wary(blind, interval)
@@ -160,11 +162,15 @@ def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
 
 
 def _two_channels(
-    a: Record, b: Record, within: tuple[float, float], limits: tuple[float, float]
+    a: Record,
+    b: Record,
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    limited: bool,
 ) -> Blind | None:
     pair = Pair(
         (travel.deflection(a.window, within), travel.deflection(b.window, within)),
-        (a.traces(within), b.traces(within)),
+        (a.traces(within, limited), b.traces(within, limited)),
         b.channel.x - a.channel.x,
         within,
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from dataclasses import dataclass, field
 
 from .events import Channel
 
-_FADED = 1 / 100  # of the strongest level of an event: what is left is no train
-_STRONG = 1 / 4  # of the strongest level: a wheelset is near
+_TYPICAL = 0.75  # quantile of the levels of an event: wheelsets, not what blows add to them
+_FADED = 1 / 100  # of the typical level of an event: what is left is no train
+_STRONG = 1 / 4  # of the typical level: a wheelset is near
 _CREEP = 1.023  # by which the least level is forgotten a frame, 10 dB/s
 _RISEN = 1.6  # over the least level: another wheelset comes, 2 dB
 _HANG_LEAST_S, _HANG_FACTOR, _HANG_MORE_S = 1.0, 2.0, 0.5
@@ -34,7 +36,7 @@ class Occupancy:
     pause_ns: dict[int, int] = field(default_factory=dict)
     strong_ns: dict[int, int] = field(default_factory=dict)
     lull_ns: dict[int, tuple[int, int]] = field(default_factory=dict)
-    _strongest: dict[int, float] = field(default_factory=dict)
+    _levels: dict[int, list[float]] = field(default_factory=dict)
     _least: dict[int, float] = field(default_factory=dict)
 
     def follow(self, channel: int, level: float, now_ns: int) -> bool:
@@ -45,17 +47,18 @@ class Occupancy:
         Returns:
             Whether the level is strong.
         """
-        strongest = max(level, self._strongest.get(channel, 0.0))
-        least = min(level, _CREEP * self._least.get(channel, level))
-        self._strongest[channel], self._least[channel] = strongest, least
-        strong = level > _STRONG * strongest
+        levels = self._levels.setdefault(channel, [])
+        insort(levels, level)
+        typical = levels[int(_TYPICAL * len(levels))]
+        least = self._least[channel] = min(level, _CREEP * self._least.get(channel, level))
+        strong = level > _STRONG * typical
         if strong:
             lull = self.strong_ns.get(channel, now_ns), now_ns
             longest = self.lull_ns.get(channel, lull)
             self.lull_ns[channel] = max(longest, lull, key=lambda span: span[1] - span[0])
             self.strong_ns[channel] = now_ns
-        near = strong or level > max(_FADED * strongest, _RISEN * least)
-        if near or _FADED * strongest < 1:
+        near = strong or level > max(_FADED * typical, _RISEN * least)
+        if near or _FADED * typical < 1:
             if channel in self.last_ns:
                 pause = now_ns - self.last_ns[channel]
                 self.pause_ns[channel] = max(pause, self.pause_ns.get(channel, 0))

@@ -19,12 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from .features import BLOW_S, FRAME_S
+
 Array = NDArray[np.float64]
 
 WINDOWS = (1, 2, 4, 8, 16)
 """Lengths of the short-term averages (frames)."""
 
-_BLOW = 4  # frames, one more than the blow of a wheel flat touches: 2 ms, a filter's 10, an edge
+_BLOW = round(BLOW_S / FRAME_S)  # frames
 
 WARM_UP = 50
 """Frames from which a floor is learned."""

@@ -84,25 +84,19 @@ def scan_channel(
     for trace, limited, band in zip(
         whole, record.traces(within, limited=True), window.bands, strict=True
     ):
-        interval = strong_interval(trace, band[1] - band[0], within)
-        if interval is None:
+        ways = []
+        for t in (trace, limited) if _struck(trace, limited, within) else (trace,):
+            interval = strong_interval(t, band[1] - band[0], within)
+            if interval is None:
+                continue
+            core = strong_interval(t, band[1] - band[0], within, CORE) or interval
+            carried = min((interval[1] - interval[0]) / max(core[1] - core[0], 1e-3), _MOST_CARRIED)
+            # one channel that is not clipped had better not try what it need not
+            stretch = SLOWEST, FASTEST * (1.0 if alone and not wave.clipped else carried)
+            matches = scan([(t, 0.0)], interval, trains, limits, stretch)
+            ways.append(Scanned(t, whole[0], wave, band, interval, stretch, matches))
+        if not ways:
             continue
-        core = strong_interval(trace, band[1] - band[0], within, CORE) or interval
-        carried = min((interval[1] - interval[0]) / max(core[1] - core[0], 1e-3), _MOST_CARRIED)
-        # one channel that is not clipped had better not try what it need not
-        stretch = SLOWEST, FASTEST * (1.0 if alone and not wave.clipped else carried)
-        ways = [
-            Scanned(
-                t,
-                whole[0],
-                wave,
-                band,
-                interval,
-                stretch,
-                scan([(t, 0.0)], interval, trains, limits, stretch),
-            )
-            for t in (trace, limited)
-        ]
         found.append(max(ways, key=lambda s: s.score))
     if not found:
         return None
@@ -111,6 +105,13 @@ def scan_channel(
     return next(
         s for s in found if s.score >= top - (_LOW_BAND_BONUS if top > HOPELESS_SCORE else 0)
     )
+
+
+def _struck(trace: Trace, limited: Trace, within: tuple[float, float]) -> bool:
+    """Whether blows carry more than half of the energy above the noise."""
+    inside = (trace.time >= within[0]) & (trace.time <= within[1])
+    total, lasts = (float(np.sum(t.energy[inside] - t.noise)) for t in (trace, limited))
+    return lasts < 0.5 * total
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def find_passage(
         return passage
     if len(records) < 2:
         return passage
-    blind = describe(records, within, reference.interval, limits)
+    blind = describe(records, within, reference.interval, limits, reference.trace.limited)
     blind = blind and at_site(blind, site)
     if blind is not None and blind.travels and off:
         # an unlisted train is likelier than a pattern at either channel and a wrong clock

@@ -13,9 +13,10 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 from .catalogue import TrainType
+from .features import BLOW_S, FRAME_S
 from .kinematics import MAX_ACCELERATION
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ DYNAMIC_RANGE = 300.0
 SLOWEST, FASTEST = 0.80, 1.25
 """Speeds tried, as fractions of a train's span over the duration of its strong energy."""
 
-_TYPICAL = 0.85  # quantile: a third of a train is within 1 m of a wheelset, half of that is above
+_ABOVE = 4.0  # energy of a blow over what lasts that counts; scores are flat from 3 to 8
 _COARSE = 1.8  # m, smoothing of the first pass
 _COARSE_BEND = 2.0  # m
 _SPEED_STEP = 0.016
@@ -62,6 +63,17 @@ class Integral:
         return np.asarray(self._sum[bins] + (place - bins) * self._rise[bins])
 
 
+def lasting(energy: Array, step: float) -> Array:
+    """Energy that does not end within :data:`BLOW_S`: its morphological opening, shape (bins,).
+
+    Args:
+        energy: per bin.
+        step: bin length (s).
+    """
+    mean = ndimage.uniform_filter1d(energy, max(round(FRAME_S / step), 1))
+    return np.asarray(ndimage.grey_opening(mean, (max(round(BLOW_S / step), 1),)))
+
+
 class Trace:
     """Band energy of one rail channel in an event, averaged over any interval of time.
 
@@ -74,8 +86,8 @@ class Trace:
         floor: noise floor of the energy.
         step: bin length (s).
         within: interval of interest (s); outside it the trace is quiet.
-        limited: whether no bin counts more than a typical wheelset: wheel flats hit the rail where
-            they please, far above the wheelsets, for a few ms.
+        limited: whether no bin counts more than what lasts about it, and the noise, by 6 dB: wheel
+            flats hit the rail where they please, far above the wheelsets, for a few ms.
     """
 
     def __init__(
@@ -91,7 +103,7 @@ class Trace:
         limited: bool = False,
     ) -> None:
         self.name, self.x, self.time, self.step = name, x, time, step
-        self.valid = valid
+        self.valid, self.limited = valid, limited
         known = np.flatnonzero(valid)
         filled: Array = np.full(energy.shape, floor)
         if known.size:
@@ -100,8 +112,8 @@ class Trace:
         if outside.any():
             filled = np.where(outside, floor, filled)
             known = np.flatnonzero(valid & ~outside)
-        if limited and known.size:
-            filled = np.minimum(filled, max(float(np.quantile(filled[known], _TYPICAL)), floor))
+        if limited:
+            filled = np.minimum(filled, _ABOVE * np.maximum(lasting(filled, step), floor))
         self.energy = filled
         strong = float(np.percentile(filled[known], 97)) if known.size else floor
         self.noise = floor
