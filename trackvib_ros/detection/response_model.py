@@ -91,22 +91,38 @@ class Spectrum:
         return self.f.size >= 8 and bool(np.any(self.y))
 
 
-def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexArray:
+def signs(wheelsets: int) -> Array:
+    """Contrasts between the four wheelsets of a car, shape (4, wheelsets).
+
+    All alike, front against rear of a bogie, leading against trailing bogie, and their product:
+    vehicles pitch on their springs, and of two close wheelsets one rolls where the other has bent
+    the track.
+    """
+    front = 1.0 - 2.0 * (np.arange(wheelsets) % 2)
+    leading = 1.0 - 2.0 * (np.arange(wheelsets) // 2 % 2)
+    return np.stack([np.ones(wheelsets), front, leading, front * leading])
+
+
+def comb(
+    places: Array, f: Array, speed: Array, acceleration: Array, weights: Array | None = None
+) -> ComplexArray:
     """Fourier transform of the wheelset times about that of the middle of the train.
 
     Args:
         places: of the wheelsets behind the middle (m).
         f: frequencies (Hz), equal steps.
         speed, acceleration: as the middle passes (m/s, m/s²), shape (motions,).
+        weights: of the wheelsets, shape (patterns, wheelsets); all 1 without.
 
     Returns:
-        Shape (motions, frequencies).
+        Shape (motions, frequencies), with weights (motions, patterns, frequencies).
     """
     v, a = speed[:, None], acceleration[:, None]
     root = np.sqrt(np.maximum(v * v + 2 * a * places, 0.01 * v * v))
     times = 2 * places / (v + root)
+    patterns = () if weights is None else (len(weights),)
     if not f.size:
-        return np.zeros((speed.size, 0), dtype=np.complex128)
+        return np.zeros((speed.size, *patterns, 0), dtype=np.complex128)
     # frequency i + block j is a product of two phases: far fewer exponentials, and a matrix product
     block = max(1, round(float(np.sqrt(f.size))))
     blocks = -(-f.size // block)
@@ -115,7 +131,10 @@ def comb(places: Array, f: Array, speed: Array, acceleration: Array) -> ComplexA
     outer = np.exp(
         -2j * np.pi * times[:, None, :] * (f[0] + step * block * np.arange(blocks))[:, None]
     )
-    return np.asarray((outer @ inner.swapaxes(1, 2)).reshape(speed.size, -1)[:, : f.size])
+    if weights is not None:
+        outer, inner = outer[:, None] * weights[:, None, :], inner[:, None]
+    product = (outer @ inner.swapaxes(-1, -2)).reshape(speed.size, *patterns, -1)
+    return np.asarray(product[..., : f.size])
 
 
 @dataclass(frozen=True)
@@ -125,6 +144,8 @@ class Model:
     Attributes:
         before, after: support of the response about the passing of its wheelset (s).
         centre: of that passing for the middle of the train, after the epoch (s).
+        deviation: power, over that of the common response, of what the wheelsets of a car differ
+            by (:func:`signs`).
     """
 
     spectrum: Spectrum
@@ -132,6 +153,12 @@ class Model:
     after: float
     misfit: float = USUAL_MISFIT
     centre: float = 0.0
+    deviation: float = 0.0
+
+    def comb(self, places: Array, speed: Array, acceleration: Array) -> ComplexArray:
+        """:func:`comb` with all that the model needs."""
+        weights = signs(places.size) if self.deviation else None
+        return comb(places, self.spectrum.f, speed, acceleration, weights)
 
     @property
     def knots(self) -> Array:
@@ -147,15 +174,25 @@ class Model:
 
     def _normal(self, combs: ComplexArray, wheelsets: int, centres: Array) -> tuple[Array, Array]:
         s, t = self.spectrum, self.knots
+        combs = combs.reshape(len(combs), -1, s.f.size)
+        motions, patterns = combs.shape[:2]
         shape = self._shape(wheelsets, t.size)
         weight = 2 * s.share / self._variance()
-        lags = np.cos(2 * np.pi * np.outer(s.f, t - t[0]))
-        column = (np.abs(combs) ** 2 * (weight * shape**2)) @ lags
+        size = np.ones(patterns)
+        size[1:] = np.sqrt(self.deviation)
+        angle = 2 * np.pi * np.outer(s.f, t - t[0])
+        lag = np.subtract.outer(np.arange(t.size), np.arange(t.size))
+        order = np.abs(lag)
+        scaled = combs * size[:, None]
+        cross = np.conj(scaled)[:, :, None] * scaled[:, None] * (weight * shape**2)
+        normal = (cross.real @ np.cos(angle))[..., order]
+        if patterns > 1:
+            normal -= (cross.imag @ np.sin(angle))[..., order] * np.sign(lag)
+        normal = normal.swapaxes(2, 3).reshape(motions, patterns * t.size, -1)
         knots = np.exp(2j * np.pi * np.outer(s.f, t))
         phase = knots[:, :, None] * np.exp(2j * np.pi * np.outer(s.f, centres))[:, None, :]
-        right = np.real((np.conj(combs) * (weight * shape * s.y)) @ phase.reshape(s.f.size, -1))
-        order = np.abs(np.subtract.outer(np.arange(t.size), np.arange(t.size)))
-        return column[:, order] + np.eye(t.size), right.reshape(len(combs), t.size, centres.size)
+        right = np.real((np.conj(scaled) * (weight * shape * s.y)) @ phase.reshape(s.f.size, -1))
+        return normal + np.eye(len(normal[0])), right.reshape(motions, -1, centres.size)
 
     def evidence(self, combs: ComplexArray, wheelsets: int, centres: Array) -> Array:
         """ln of the marginal likelihood over that of a disturbance with the same spectrum.
@@ -163,7 +200,7 @@ class Model:
         The response has a Gaussian prior with the spectrum of what is observed.
 
         Args:
-            combs: :func:`comb` of every motion, shape (motions, frequencies).
+            combs: :meth:`comb` of every motion.
             wheelsets: their number.
             centres: trial values of :attr:`centre`, shape (centres,).
 
@@ -184,9 +221,9 @@ class Model:
     def response(self, places: Array, speed: float, acceleration: float) -> ComplexArray:
         """Fourier transform of the most probable response, about the middle of the train."""
         s, t = self.spectrum, self.knots
-        combs = comb(places, s.f, np.array([speed]), np.array([acceleration]))
+        combs = self.comb(places, np.array([speed]), np.array([acceleration]))
         normal, right = self._normal(combs, places.size, np.array([self.centre]))
-        knots = np.linalg.solve(normal[0], right[0, :, 0])
+        knots = np.linalg.solve(normal[0], right[0, :, 0])[: t.size]
         series = np.exp(-2j * np.pi * np.outer(s.f, t + self.centre)) @ knots
         return np.asarray(self._shape(places.size, t.size) * series)
 

@@ -14,14 +14,13 @@ from .response_model import (
     Model,
     Observation,
     Spectrum,
-    comb,
 )
-from .unlisted import CAR, EqualCars, starts
+from .unlisted import CAR, FAMILY, EqualCars, starts
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-CORRELATED = 2.5
+CORRELATED = 3.0
 """Misfit is not white: its neighbouring coefficients go together, so that this many count as one.
 Mean square of error over sigma of the speed on computed passages when counted as independent."""
 
@@ -36,6 +35,7 @@ KEPT = 15.0
 """Evidence below the best at which a hypothesis is dropped."""
 
 _MISFITS = 0.5, 0.25, 0.12, 0.06, 0.03, 0.015  # parts of the spectrum that no response explains
+_DEVIATIONS = 0.03, 0.1, 0.3  # power of what wheelsets of a car differ by, over the common
 _REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
 _MIDDLE, _FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
@@ -47,9 +47,10 @@ _SHRUNK, _WEAKEST, _HEAVIEST = 1.5, 0.65, 2.5
 _BLUR = 0.4  # of the evidence, what a coarse grid and an unknown misfit may cost
 _CLEAR = 20.0  # evidence of a motion without acceleration
 _MOST = 10  # hypotheses that are followed
+_VARIED = 6  # of them whose wheelsets may differ
 _PEAKS = 5  # of a type and orientation
 _CARS = (30.0, 13.5)  # m, longest and shortest cars, at the lowest and the highest speed
-_HALF = 0.12  # ln of speed, half the range of a train of equal cars: half of one car of four
+_ABOUT = -0.12, 0.12  # ln of speed, range of a train of equal cars: one car of four
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class ResponseFit:
         models: one per observation.
         motion: its distance is that of the first wheelset past the reference channel.
         evidence: ln of the marginal likelihood over that of a disturbance.
+        common: the fit with one response for all wheelsets, if they may differ here.
     """
 
     train: TrainType
@@ -69,6 +71,7 @@ class ResponseFit:
     evidence: float
     models: tuple[Model, ...] = ()
     covariance: Array | None = None
+    common: ResponseFit | None = None
 
     @property
     def places(self) -> Array:
@@ -120,7 +123,7 @@ class Search:
 
     def combs(self, k: int, model: Model, places: Array, v: Array, a: Array) -> ComplexArray:
         """Of trial motions, stated at the common epoch, for observation ``k``."""
-        return comb(places, model.spectrum.f, v + a * (self.seen[k].epoch - self.epoch), a)
+        return model.comb(places, v + a * (self.seen[k].epoch - self.epoch), a)
 
     def coarse(
         self,
@@ -269,6 +272,59 @@ class Search:
             models.append(trials[int(np.argmax(values))])
         return replace(fit, models=tuple(models))
 
+    def varied(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        """The likely ones of shared fits with wheelsets that may differ within a car.
+
+        By how much is sought at the most probable listed type and at the most probable train of
+        equal cars, and allowed to all. Most probable first.
+        """
+        leaders: dict[bool, ResponseFit] = {}
+        for fit in fits:
+            leaders.setdefault(fit.train.family == FAMILY, fit)
+        least = (1 - _BLUR) * fits[0].evidence - KEPT
+        near = [*leaders.values()]
+        near += [f for f in fits if f.evidence > least and all(f is not n for n in near)][
+            : _VARIED - len(near)
+        ]
+        models = [self._deviating(fit) for fit in leaders.values()]
+        out = []
+        for fit in near:
+            own = []
+            for k in range(len(self.seen)):
+                centres = np.unique(np.round([f.models[k].centre for f in near], 4))
+                best = -np.inf, fit.models[k]
+                for each in models:
+                    values = each[k].evidence(self._own(k, each[k], fit), fit.places.size, centres)[
+                        0
+                    ]
+                    i = int(np.argmax(values))
+                    if values[i] > best[0]:
+                        best = float(values[i]), replace(each[k], centre=float(centres[i]))
+                own.append(best[1])
+            free = replace(fit, models=tuple(own), common=fit)
+            moved = self.climb(free, _FINE, 2)
+            told = self.beside(moved, _FINE)
+            covariance = fit.covariance if told.covariance is None else told.covariance
+            out.append(replace(moved, covariance=covariance))
+        return sorted(out, key=lambda fit: -fit.evidence)
+
+    def _deviating(self, fit: ResponseFit) -> list[Model]:
+        """Its models with the deviations and misfits of most evidence."""
+        out = []
+        for k, model in enumerate(fit.models):
+            smaller = [m for m in _MISFITS if m <= model.misfit][:3]
+            trials = [
+                replace(model, deviation=deviation, misfit=misfit)
+                for deviation in _DEVIATIONS
+                for misfit in smaller
+            ]
+            out.append(max(trials, key=lambda trial: self._value(k, trial, fit)))
+        return out
+
+    def _value(self, k: int, model: Model, fit: ResponseFit) -> float:
+        combs = self._own(k, model, fit)
+        return float(model.evidence(combs, fit.places.size, np.array([model.centre]))[0, 0])
+
     def shared(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """Every fit with the models of whichever fit suit it best, most probable first.
 
@@ -279,7 +335,10 @@ class Search:
         for fit in fits:
             models = []
             for k, own in enumerate(fit.models):
-                trials = {(m.before, m.after, m.misfit): m for m in (f.models[k] for f in fits)}
+                trials = {
+                    (m.before, m.after, m.misfit, m.deviation): m
+                    for m in (f.models[k] for f in fits)
+                }
                 starts = [own.centre, *(m.centre for m in trials.values())]
                 centres = np.unique(np.round(starts, 4))
                 best = -np.inf, own
@@ -320,20 +379,18 @@ class Search:
         found.sort(key=lambda fit: -fit.evidence)
         return found[:_PEAKS]
 
-    def unlisted(self) -> ResponseFit | None:
+    def unlisted(self) -> tuple[ResponseFit, EqualCars] | None:
         """The train of equal cars that explains most; its speed is that of cars of 20 m."""
         sizes = [limit * CAR[0] / length for limit, length in zip(self.limits, _CARS, strict=True)]
         search = Search(self.seen, (sizes[0], sizes[1]))
         found = []
         for cars in starts():
-            near = search.coarse(cars.train, False, bent=False, spread=(-_HALF, _HALF))
+            near = search.coarse(cars.train, False, bent=False, spread=_ABOUT)
             found += [(fit, cars) for fit in near[:1]]
         if not found:
             return None
         fit, cars = max(found, key=lambda pair: pair[0].evidence)
-        fit = search.refined(search.coarse(cars.train, False, spread=(-_HALF, _HALF))[:2] or [fit])[
-            0
-        ]
+        fit = search.refined(search.coarse(cars.train, False, spread=_ABOUT)[:2] or [fit])[0]
         for trials in (EqualCars.numbers, EqualCars.proportions, EqualCars.numbers):
             v = fit.speed * (1 + 0.06 * _FINE / fit.train.span * np.arange(-2.0, 3.0, 2.0))
             a = np.full(v.size, fit.acceleration)
@@ -342,7 +399,18 @@ class Search:
                 values.append(float(search.total(replace(fit, train=trial.train), v, a).max()))
             cars = trials(cars)[int(np.argmax(values))]
             fit = replace(fit, train=cars.train)
-        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2)
+        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2), cars
+
+    def proportions(self, fit: ResponseFit, cars: EqualCars) -> tuple[ResponseFit, Array]:
+        """The best proportions of equal cars whose wheelsets may differ, and the evidence of all.
+
+        At the passing time of the fit.
+        """
+        v, a = np.array([fit.speed]), np.array([fit.acceleration])
+        near = [replace(fit, train=trial.train) for trial in cars.proportions()]
+        values = np.array([float(self.total(each, v, a)[0]) for each in near])
+        best = near[int(np.argmax(values))]
+        return replace(best, evidence=float(values.max())), values
 
     def _own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
         v, a = np.array([fit.speed]), np.array([fit.acceleration])

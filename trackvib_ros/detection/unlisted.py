@@ -14,9 +14,13 @@ CAR = 20.0, 0.2
 to 30 m long (short articulated bodies and metros; the longest of EN 1991-2 and of the UIC have 27
 and 26.4 m)."""
 
-ALTERNATIVES = 24
-"""Proportions that a channel tells apart about a given one: three numbers of cars, four distances
-of bogies, two wheelbases."""
+FAMILY = "unlisted"
+
+NUMBERS_APART = 3
+"""Numbers of cars that a channel tells apart about a given one, each as likely."""
+
+ALTERNATIVES = NUMBERS_APART * 8
+"""With four distances of bogies and two wheelbases that it tells apart."""
 
 _NUMBERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 23, 26, 30)
 _CENTRES = (0.62, 0.72)  # over the length of a car, of those that a first look tells apart
@@ -55,7 +59,7 @@ class EqualCars:
         axles = CAR[0] * (np.array(places) - places[0])
         name = f"{self.cars} equal cars, {self.centres:.2f}, {self.base:.3f}"
         length = self.cars * CAR[0]
-        return TrainType(name, tuple(float(a) for a in axles), self.cars, 1, "unlisted", length)
+        return TrainType(name, tuple(float(a) for a in axles), self.cars, 1, FAMILY, length)
 
     def numbers(self) -> list[EqualCars]:
         """The same cars, up to three more or fewer."""
