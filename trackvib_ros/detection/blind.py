@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import travel
-from .bowl import WAVENUMBER, WAVENUMBER_SPREAD
 from .calibration import POSITION_SIGMA, Calibration
 from .kinematics import Motion
 from .place import Wave, likelihood, locate
 from .record import Record
-from .single import HUMP, HUMP_FINE, alone, log_energy
+from .single import HUMP, HUMP_FINE, Shown, alone, log_energy
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -33,6 +32,8 @@ _PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bo
 _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
 _LEAST_WORTH = 25.0  # e^25 outweighs the speeds and pulses tried, as for two channels
 _LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right than wrong
+_ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
+_CARRIED = 4.0  # m, strong energy before the first wheelset and behind the last (0 to 3.4 m)
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
 
@@ -81,6 +82,20 @@ class Blind:
         """Distances between successive wheelsets (m)."""
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
 
+    def contradicts(self, places: Array, motion: Motion) -> bool:
+        """Whether a bogie or more of this train, beyond doubt, is not where a type has one.
+
+        Args:
+            places: of the type's wheelsets, in order (m).
+            motion: of the type past the reference point.
+        """
+        if not self.travels or self.regular < CONFIDENT:
+            return False
+        own = motion.distance_at(self.times)
+        apart = np.abs(own[:, None] - places[None, :])
+        elsewhere = max(int(np.sum(apart.min(axis=k) > _ELSEWHERE)) for k in (0, 1))
+        return elsewhere >= 2
+
 
 def describe(
     records: Sequence[Record],
@@ -100,9 +115,7 @@ def describe(
     """
     ordered = sorted(records, key=lambda r: r.channel.x)
     blind = _two_channels(ordered[0], ordered[-1], within, limits, limited)
-    if blind is None or blind.regular >= CONFIDENT:
-        return blind
-    return _wary(blind, interval)
+    return blind and _wary(blind, interval)
 
 
 def at_site(blind: Blind, site: Calibration) -> Blind:
@@ -132,10 +145,18 @@ def at_site(blind: Blind, site: Calibration) -> Blind:
 
 
 def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
-    """With the doubt that wheelsets before the first or after the last one were missed."""
+    """With the doubt that wheelsets before the first or after the last one were missed.
+
+    Strong energy that no wheelset explains is one that was missed; where the number of wheelsets
+    is in doubt, that which the rail carries is one too.
+    """
+    carried = _CARRIED / blind.speed[0] if blind.regular >= CONFIDENT else 0.0
     sigma = blind.time_sigma.copy()
-    sigma[0] = np.hypot(sigma[0], max(float(blind.times[0]) - interval[0], 0.0))
-    sigma[-1] = np.hypot(sigma[-1], max(interval[1] - float(blind.times[-1]), 0.0))
+    for k, missed in (
+        (0, float(blind.times[0]) - interval[0]),
+        (-1, interval[1] - float(blind.times[-1])),
+    ):
+        sigma[k] = np.hypot(sigma[k], missed if missed > carried else 0.0)
     return replace(blind, time_sigma=sigma)
 
 
@@ -254,27 +275,9 @@ def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:
     return bogies >= _LEAST_BOGIES and bool(many)
 
 
-def describe_alone(
-    record: Record,
-    within: tuple[float, float],
-    interval: tuple[float, float],
-    limits: tuple[float, float],
-    guess: float | None,
-    band: int,
-    bowl: tuple[float, float] = (WAVENUMBER, WAVENUMBER_SPREAD),
-) -> Blind | None:
-    """What one rail channel tells of a train that no catalogue type explains.
-
-    Args:
-        record: rail channel.
-        within: the event (s).
-        interval: first and last strong energy (s).
-        limits: speeds (m/s).
-        guess: speed of the nearest catalogue type (m/s).
-        band: whose energies show most.
-        bowl: wavenumber of the rail's deflection (rad/m), relative standard deviation.
-    """
-    found = alone(record, within, interval, limits, guess, band, bowl)
+def describe_alone(shown: Shown) -> Blind | None:
+    """What one rail channel tells of a train that no catalogue type explains."""
+    found = alone(shown)
     if found is None:
         return None
     speed, sigma, span = found.speed
@@ -284,8 +287,8 @@ def describe_alone(
     deflected = found.corner is not None
     whole = deflected and paired.mean() > _PAIRED
     blind = Blind(
-        sensors=(record.channel.name,),
-        x=record.channel.x,
+        sensors=(shown.record.channel.name,),
+        x=shown.record.channel.x,
         motion=found.motion,
         speed=(speed, sigma),
         times=found.times,
@@ -296,10 +299,10 @@ def describe_alone(
         travels=found.corner is not None
         and found.corner.worth(2) > _LEAST_WORTH
         and found.certainty > _LIKELY
-        and found.paired > _PAIRED
+        and found.bogies.clear
         and found.times.size >= 2 * _LEAST_WHEELSETS,
         method=found.method,
         axle_method="deflection of the rail" if deflected else "energy peak",
         interval=span,
     )
-    return blind if blind.regular >= CONFIDENT else _wary(blind, interval)
+    return _wary(blind, shown.interval)

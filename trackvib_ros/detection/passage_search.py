@@ -14,12 +14,14 @@ from .passage_fit import CERTAIN, fit_hypotheses
 from .passage_scan import HOPELESS_SCORE, scan_channel
 from .place import Wave
 from .record import Record
+from .single import Shown
 from .strength import excited, quiet_gaps
 
 CLOCK_SCORE = 0.85
 """Least pattern correlation at which a clock, and not an unlisted train, is held responsible for
 delays that no type explains: patterns of unlisted trains correlate with listed ones up to 0.83."""
 
+_EXACT = 0.1  # m, scatter of wheelsets at which no unlisted train is mistaken for their type
 _AROUND_S = 0.5  # s, of an interval of strong energy that belongs to its train
 
 
@@ -103,7 +105,12 @@ def find_passages(
     found = _divided(rails, within, whole, catalogue, limits, site, unlisted, depth=3)
     if len(rails) > 1 or not unlisted:
         return found
-    return [p if p.known else _described(rails[0], within, p, limits, site) for p in found]
+    return [
+        p
+        if p.known and p.hypotheses[0].fit.scale < _EXACT
+        else _described(rails[0], within, p, limits, site)
+        for p in found
+    ]
 
 
 def bowl_of(record: Record, passage: Passage) -> Corner | None:
@@ -133,7 +140,7 @@ def _described(
     limits: tuple[float, float],
     site: Calibration,
 ) -> Passage:
-    """What the only rail channel tells of a train that no type explains."""
+    """What the only rail channel tells of a train that no type explains, or not beyond doubt."""
     guess = None
     if passage.hypotheses:
         best = passage.hypotheses[0]
@@ -142,8 +149,14 @@ def _described(
     alone = (max(within[0], start - _AROUND_S), min(within[1], end + _AROUND_S))
     band = record.window.bands.index(passage.band)
     bowl = site.wavenumber(record.channel.name)
-    blind = describe_alone(record, alone, passage.interval, limits, guess, band, bowl)
-    return replace(passage, blind=blind)
+    shown = Shown(record, alone, passage.interval, limits, guess, band, bowl)
+    blind = describe_alone(shown)
+    if not passage.known:
+        return replace(passage, blind=blind)
+    best = passage.hypotheses[0]
+    if blind is None or not blind.contradicts(best.places, best.fit.motion):
+        return passage
+    return replace(passage, blind=blind, contradicted=True)
 
 
 def _divided(

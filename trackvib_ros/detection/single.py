@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +42,11 @@ _APART = 1.2  # ratio of different trials
 _LEVELS = (0.3, 0.5, 0.7, 1.0)
 _ROUGHNESS = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the bowl's highest density
 _AMONG = (2.0, 60.0)  # Hz, in which trials are compared
-_PARTNER = 3.6  # m, wheelsets of one bogie, of any train at the typical bowl
 _SAME_GAP = 0.06  # of a wheelbase, between bogies of one build
-_LEAST_BASE = 1.4  # m
-_BASES = (1.5, 3.6)  # m, wheelbases that exist, by a scale that is good to a fifth
 _BOGIE = 1.4  # wheelbases, beyond which the next wheelset is of another bogie
-_LEAST_BOGIES = 3
+_BASES = (1.5, 3.6)  # m, wheelbases that exist, by a bowl that is good to a fifth
+_LEAST_BOGIES = 5  # double blows of a hammer may make four
+_EVEN = 0.15  # of the wheelbase, robust scatter about it; of gaps of any length it is half
 _LEAST_WHEELSETS = 4
 _LEAST_QUIET = 100  # samples that tell the noise
 _ENERGETIC = 1  # speeds at which energies are looked at
@@ -54,8 +54,80 @@ _LONGEST = 800.0  # m of train
 _SURE = 0.9  # probability of a number of wheelsets ...
 _ALL = 0.95  # ... and part of what is no noise that they explain, at which no other trial is needed
 _PAIRED = 0.7
-_AGREE = 1.15  # of successive trials, at which the scale is settled
+_AGREE = 1.15  # of speeds that need not both be tried
+_SETTLED = 1.25  # of a trial against its wheelbase, of the pulses it was looked at with
+_MOST_TRIALS = 12
 _GRID = np.linspace(-0.6, 0.6, 1201)  # ln of speed over the first guess
+
+
+@dataclass(frozen=True)
+class Bogies:
+    """How wheelsets stand in bogies of two or three of one wheelbase, if they do.
+
+    Attributes:
+        base: the wheelbase (s); 0 without bogies.
+        share: of the wheelsets that stand in them.
+        scatter: of the gaps in bogies about it (s), robust standard deviation.
+    """
+
+    base: float = 0.0
+    share: float = 0.0
+    scatter: float = 0.0
+
+    @property
+    def clear(self) -> bool:
+        """Whether most wheelsets do, at one gap."""
+        return self.share > _PAIRED and self.scatter < _EVEN * self.base
+
+    def speeds(self) -> list[float]:
+        """Speeds (m/s) that make it a wheelbase that trains have, likeliest first."""
+        return [mean / self.base for _, mean, _ in WHEELBASES] if self.clear else []
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What one rail channel shows of an event.
+
+    Attributes:
+        record: of the channel.
+        within: the event (s).
+        interval: first and last strong energy (s).
+        limits: speeds (m/s).
+        guess: of the speed, by the nearest catalogue type (m/s); ``None`` without.
+        band: whose energies show most.
+        bowl: wavenumber k0 of the rail's deflection (rad/m), relative standard deviation.
+    """
+
+    record: Record
+    within: tuple[float, float]
+    interval: tuple[float, float]
+    limits: tuple[float, float]
+    guess: float | None
+    band: int
+    bowl: tuple[float, float] = (WAVENUMBER, WAVENUMBER_SPREAD)
+
+    @cached_property
+    def wave(self) -> Wave:
+        """The waveform below 100 Hz."""
+        window = self.record.window
+        return Wave(window.time - window.low_shift, window.low, window.valid)
+
+    @property
+    def quiet(self) -> float:
+        """Variance of the waveform before the event; 0 where that is not on record."""
+        before = self.wave.valid & (self.wave.time < self.within[0])
+        return float(np.var(self.wave.value[before])) if before.sum() > _LEAST_QUIET else 0.0
+
+    @property
+    def top(self) -> float:
+        """Highest speed of a train that is not longer than trains are (m/s)."""
+        return min(self.limits[1], _LONGEST / max(self.interval[1] - self.interval[0], 0.1))
+
+    def axis(self, speed: float) -> Array:
+        """Edges (s) of cells of distance over all the train at a speed (m/s)."""
+        half = 8.0 / speed
+        n = int((self.interval[1] - self.interval[0] + 2 * half) * speed / travel.CELL)
+        return np.asarray(self.interval[0] - half + travel.CELL / speed * np.arange(n + 1))
 
 
 @dataclass(frozen=True)
@@ -69,7 +141,7 @@ class Single:
         certainty: probability that their number is right.
         contrast: typical pulse over the noise of its estimate.
         corner: of the deflection; ``None`` if it was not seen.
-        paired: part of the wheelsets in bogies of two or three.
+        bogies: how the wheelsets stand.
         method: what the scale is from.
     """
 
@@ -80,12 +152,13 @@ class Single:
     certainty: float
     contrast: float
     corner: Corner | None
-    paired: float
+    bogies: Bogies
     method: str
 
 
-def _trials(wave: Wave, interval: tuple[float, float], quiet: float, limits: Array) -> Array:
+def _trials(shown: Shown) -> Array:
     """Speeds (m/s) at which the spectrum of the deflection is likely (Whittle), likeliest first."""
+    wave, interval = shown.wave, shown.interval
     first, last = np.searchsorted(wave.time, [interval[0] - 0.1, interval[1] + 0.1])
     value = wave.value[first:last] * wave.valid[first:last]
     if value.size < 64:
@@ -98,8 +171,8 @@ def _trials(wave: Wave, interval: tuple[float, float], quiet: float, limits: Arr
     use = (f > 1.5) & (f < min(100.0, 0.4 / step))
     f, power = f[use], power[use]
     gain = low_pass(f, step)
-    noise = quiet * gain / float(low_pass(np.linspace(0, 0.5 / step, 500), step).mean())
-    speeds = np.geomspace(limits[0], limits[1], _SPEEDS)
+    noise = shown.quiet * gain / float(low_pass(np.linspace(0, 0.5 / step, 500), step).mean())
+    speeds = np.geomspace(shown.limits[0], shown.top, _SPEEDS)
     x = f[:, None] * 2 * np.pi / (speeds * WAVENUMBER)
     bowl = gain[:, None] * x**4 / (1 + x**4) ** 2
     strength = power.sum() / bowl.sum(axis=0)
@@ -126,12 +199,6 @@ def _pulse() -> Array:
     return travel.band_pass(bending, travel.FINE, travel.BROAD)
 
 
-def _axis(interval: tuple[float, float], speed: float) -> Array:
-    half = 8.0 / speed
-    n = int((interval[1] - interval[0] + 2 * half) * speed / travel.CELL)
-    return np.asarray(interval[0] - half + travel.CELL / speed * np.arange(n + 1))
-
-
 def _seen(signal: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
     output = np.convolve(signal, pulse[::-1], "same")
     sign = 1.0 if np.quantile(output, 0.98) > -np.quantile(output, 0.02) else -1.0
@@ -147,86 +214,77 @@ class _Trial:
     times: Array
     corner: Corner | None
     gain: float
-    base: tuple[float, float, float]
+    bogies: Bogies
 
     @property
     def rank(self) -> tuple[int, float]:
         """Wheelsets in bogies, whose number is likely, before others; then what they explain."""
-        return 2 * (self.base[2] > _PAIRED) + (self.found.certainty > 0.5), self.gain
+        return 2 * self.bogies.clear + (self.found.certainty > 0.5), self.gain
 
 
-def _weighed(
-    wave: Wave, speed: float, found: Wheelsets, times: Array, wavenumber: float, unknowns: int
-) -> _Trial:
+def _weighed(shown: Shown, speed: float, found: Wheelsets, times: Array, unknowns: int) -> _Trial:
     """A trial with what its wheelsets, of so many unknowns each, explain of the deflection."""
-    fine = corner(wave, times, WAVENUMBER * speed, _AMONG, refits=0)
-    if fine is None:
-        return _Trial(speed, found, times, None, -np.inf, _wheelbase(times, speed))
-    gain = fine.worth(unknowns)
-    base = _wheelbase(times, fine.value / wavenumber if gain > 0 else speed)
-    return _Trial(speed, found, times, fine, gain, base)
+    fine = corner(shown.wave, times, WAVENUMBER * speed, _AMONG, refits=0)
+    gain = -np.inf if fine is None else fine.worth(unknowns)
+    return _Trial(speed, found, times, fine, gain, bogies(times))
 
 
-def _deflected(
-    wave: Wave,
-    record: Record,
-    within: tuple[float, float],
-    interval: tuple[float, float],
-    speeds: Sequence[float],
-    limits: tuple[float, float],
-    wavenumber: float,
-) -> tuple[list[_Trial], bool]:
-    """Wheelsets by the bowls of the deflection; whether the last of them are beyond doubt."""
-    series = travel.deflection(record.window, within)
-    start = float(wave.time[0])
-    calm = travel.deflection(record.window, (start, within[0]))
+def _deflected(shown: Shown, speeds: Sequence[float]) -> tuple[list[_Trial], bool]:
+    """Wheelsets by the bowls of the deflection; whether the last of them are beyond doubt.
+
+    What is found at one speed tells the next: by its bowl, and by the wheelbase of its bogies.
+    """
     out: list[_Trial] = []
     tried: list[float] = []
-    for speed in speeds:
-        trial = speed
-        for _ in range(2):
-            inside = limits[0] <= trial <= limits[1]
-            if not inside or any(abs(np.log(trial / v)) < np.log(_AGREE) for v in tried):
-                break
-            tried.append(trial)
-            edges = _axis(interval, trial)
-            quiet = np.arange(start, within[0], travel.CELL / trial)
-            cells = travel.band_pass(series.cells(edges), travel.FINE, travel.BROAD)
-            noise, possible = None, 1.0
-            if quiet.size > _LEAST_QUIET:
-                noise = travel.band_pass(calm.cells(quiet), travel.FINE, travel.BROAD)
-                possible -= min(float(np.var(noise) / max(np.var(cells), 1e-300)), 0.5)
-            found = _seen(cells, noise, _pulse())
-            if found is None or found.place.size < _LEAST_WHEELSETS:
-                break
-            times = edges[0] + (found.place + 0.5 * travel.CELL) / trial
-            out.append(_weighed(wave, trial, found, times, wavenumber, 2))
-            if out[-1].corner is None:
-                break
-            good = found.certainty > _SURE and found.explained > _ALL * possible
-            if good and out[-1].base[2] > _PAIRED and out[-1].gain > 0:
-                return out, True
-            trial = out[-1].corner.value / wavenumber
+    queue = list(speeds)
+    while queue and len(tried) < _MOST_TRIALS:
+        speed = queue.pop(0)
+        inside = shown.limits[0] <= speed <= shown.top
+        if not inside or any(abs(np.log(speed / v)) < np.log(_AGREE) for v in tried):
+            continue
+        tried.append(speed)
+        trial, possible = _pulses(shown, speed)
+        if trial is None:
+            continue
+        out.append(trial)
+        good = trial.found.certainty > _SURE and trial.found.explained > _ALL * possible
+        settled = any(abs(np.log(speed / v)) < np.log(_SETTLED) for v in trial.bogies.speeds())
+        if good and settled and trial.gain > 0:
+            return out, True
+        by_bowl = [] if trial.corner is None else [trial.corner.value / shown.bowl[0]]
+        queue = trial.bogies.speeds() + by_bowl + queue
     return out, False
 
 
-def _energetic(
-    wave: Wave,
-    record: Record,
-    within: tuple[float, float],
-    interval: tuple[float, float],
-    speeds: Sequence[float],
-    wavenumber: float,
-    band: int,
-) -> list[_Trial]:
+def _pulses(shown: Shown, speed: float) -> tuple[_Trial | None, float]:
+    """Wheelsets by their bowls at a speed (m/s), and how much of the waveform is no noise."""
+    window, start = shown.record.window, float(shown.wave.time[0])
+    edges = shown.axis(speed)
+    quiet = np.arange(start, shown.within[0], travel.CELL / speed)
+    series = travel.deflection(window, shown.within)
+    cells = travel.band_pass(series.cells(edges), travel.FINE, travel.BROAD)
+    noise, possible = None, 1.0
+    if quiet.size > _LEAST_QUIET:
+        calm = travel.deflection(window, (start, shown.within[0]))
+        noise = travel.band_pass(calm.cells(quiet), travel.FINE, travel.BROAD)
+        possible -= min(float(np.var(noise) / max(np.var(cells), 1e-300)), 0.5)
+    found = _seen(cells, noise, _pulse())
+    if found is None or found.place.size < _LEAST_WHEELSETS:
+        return None, possible
+    times = edges[0] + (found.place + 0.5 * travel.CELL) / speed
+    return _weighed(shown, speed, found, times, 2), possible
+
+
+def _energetic(shown: Shown, speeds: Sequence[float]) -> list[_Trial]:
     """Wheelsets in the log-energies of a band."""
     lag = np.arange(-60, 61) * travel.CELL
     hump = travel.band_pass(np.exp(-0.5 * (lag / HUMP) ** 2), HUMP_FINE, travel.BROAD)
+    record, within = shown.record, shown.within
     before = (float(record.window.time[0]), within[0])
-    trace, calm = record.traces(within)[band], record.traces(before)[band]
+    trace, calm = record.traces(within)[shown.band], record.traces(before)[shown.band]
     out: list[_Trial] = []
     for speed in speeds:
-        edges, quiet = _axis(interval, speed), np.arange(*before, travel.CELL / speed)
+        edges, quiet = shown.axis(speed), np.arange(*before, travel.CELL / speed)
         cells = travel.band_pass(log_energy(trace, edges), HUMP_FINE, travel.BROAD)
         noise = None
         if quiet.size > _LEAST_QUIET:
@@ -234,7 +292,7 @@ def _energetic(
         found = find(cells, noise, hump)
         if found is not None and found.place.size >= _LEAST_WHEELSETS:
             times = edges[0] + (found.place + 0.5 * travel.CELL) / speed
-            out.append(_weighed(wave, speed, found, times, wavenumber, 1))
+            out.append(_weighed(shown, speed, found, times, 1))
     return out
 
 
@@ -243,27 +301,30 @@ def log_energy(trace: Trace, edges: Array) -> Array:
     return np.asarray(np.log(np.maximum(trace.mean(edges[:-1], edges[1:]), trace.noise)))
 
 
-def _wheelbase(times: Array, speed: float) -> tuple[float, float, float]:
-    """Commonest gap within bogies (s), its sigma, and the part of the wheelsets in bogies."""
+def bogies(times: Array) -> Bogies:
+    """The bogies of wheelsets (s), whatever their speed: two or three at one gap, others further.
+
+    Of all gaps that repeat, the one that leaves the fewest wheelsets alone or in longer rows.
+    """
     gaps = np.diff(times)
-    short = gaps[(gaps * speed > _LEAST_BASE) & (gaps * speed < _PARTNER)]
-    if not short.size:
-        return 0.0, 0.0, 0.0
-    near = np.abs(np.log(short[:, None] / short[None, :])) < _SAME_GAP
-    members = short[near[int(np.argmax(near.sum(axis=1)))]]
-    base = float(np.median(members))
-    if not _BASES[0] < base * speed < _BASES[1]:
-        return 0.0, 0.0, 0.0
-    # bogies are groups of two or three: what rings on has more, and never ends
-    groups = np.split(np.arange(times.size), 1 + np.flatnonzero(gaps > _BOGIE * base))
-    bogies = [group.size for group in groups if group.size in (2, 3)]
-    share = sum(bogies) / times.size if len(bogies) >= _LEAST_BOGIES else 0.0
-    return base, 2**0.5 * PLACE_SIGMA / speed, share
+    near = np.abs(np.log(gaps[:, None] / gaps[None, :])) < _SAME_GAP
+    best = Bogies()
+    for k in np.argsort(gaps):
+        base = float(np.median(gaps[near[k]]))
+        # what rings on has more than three, and never ends
+        ends = 1 + np.flatnonzero(gaps > _BOGIE * base)
+        sizes = [group.size for group in np.split(times, ends) if group.size in (2, 3)]
+        share = sum(sizes) / times.size if len(sizes) >= _LEAST_BOGIES else 0.0
+        if share > best.share:
+            inner = np.concatenate([np.diff(g) for g in np.split(times, ends) if g.size in (2, 3)])
+            scatter = 1.4826 * float(np.median(np.abs(inner - base)))
+            best = Bogies(base, share, scatter)
+    return best
 
 
 def _posterior(
     guess: float,
-    base: tuple[float, float, float],
+    stand: Bogies,
     bowl: tuple[float, float] | None,
     limits: tuple[float, float],
 ) -> tuple[float, float, tuple[float, float]]:
@@ -271,17 +332,19 @@ def _posterior(
 
     Args:
         guess: about which it is looked for (m/s).
-        base: what :func:`_wheelbase` gives.
+        stand: how the wheelsets stand in bogies.
         bowl: speed by the bowl (m/s), relative standard deviation.
         limits: of speeds (m/s).
     """
     speed = float(np.clip(guess, *limits)) * np.exp(_GRID)
     log = np.where((speed >= limits[0]) & (speed <= limits[1]), 0.0, -np.inf)
-    if base[0] > 0:
-        length = speed * base[0]
+    if stand.clear:
+        length = speed * stand.base
+        # those of one build are seen with one error
+        measured = np.hypot(2**0.5 * PLACE_SIGMA, stand.scatter * speed)
         density = np.zeros(speed.size)
         for share, mean, sigma in WHEELBASES:
-            spread = np.hypot(sigma, base[1] * speed)
+            spread = np.hypot(sigma, measured)
             density += share / spread * np.exp(-0.5 * ((length - mean) / spread) ** 2)
         log += np.log(density + 1e-12)
     if bowl is not None:
@@ -295,68 +358,71 @@ def _posterior(
     return mean, sigma, (low, high)
 
 
-def alone(
-    record: Record,
-    within: tuple[float, float],
-    interval: tuple[float, float],
-    limits: tuple[float, float],
-    guess: float | None,
-    band: int,
-    bowl: tuple[float, float] = (WAVENUMBER, WAVENUMBER_SPREAD),
-) -> Single | None:
-    """What one rail channel tells of a train that no catalogue type explains.
-
-    Args:
-        record: of the channel.
-        within: the event (s).
-        interval: first and last strong energy (s).
-        limits: speeds (m/s).
-        guess: of the speed, by the nearest type (m/s).
-        band: whose energies show most.
-        bowl: wavenumber k0 of the site (rad/m), relative standard deviation.
-    """
-    window = record.window
-    wave = Wave(window.time - window.low_shift, window.low, window.valid)
-    before = wave.valid & (wave.time < within[0])
-    quiet = float(np.var(wave.value[before])) if before.sum() > _LEAST_QUIET else 0.0
-    top = min(limits[1], _LONGEST / max(interval[1] - interval[0], 0.1))
-    if top < limits[0] * _APART:
+def alone(shown: Shown) -> Single | None:
+    """What one rail channel tells of a train that no catalogue type explains."""
+    if shown.top < shown.limits[0] * _APART:
         return None
-    speeds = [] if guess is None else [guess]
-    speeds += [float(v) for v in _trials(wave, interval, quiet, np.array([limits[0], top]))]
-    speeds = [v for v in speeds if v <= top]
-    trials, sure = _deflected(wave, record, within, interval, speeds, (limits[0], top), bowl[0])
+    speeds = [] if shown.guess is None else [shown.guess]
+    speeds += [float(v) for v in _trials(shown)]
+    speeds = [v for v in speeds if v <= shown.top]
+    trials, sure = _deflected(shown, speeds)
     if not sure:
-        trials += _energetic(wave, record, within, interval, speeds[:_ENERGETIC], bowl[0], band)
+        trials += _energetic(shown, speeds[:_ENERGETIC])
     if not trials:
         return None
     best = max(trials, key=lambda trial: trial.rank)
-    times, fine = best.times, None
-    if best.corner is not None:
-        first = WAVENUMBER * best.speed
-        for unknowns in (
-            2,
-            1,
-        ):  # places and loads, or the loads alone at the places that were found
-            trial = corner(wave, times, first, refits=unknowns - 1)
-            trial = trial and corner(wave, trial.times, trial.value, refits=unknowns - 1)
-            if trial is not None and trial.worth(unknowns) > 0:
-                fine = trial
-                break
+    fine = _bowl(shown, best)
+    limits = (shown.limits[0], shown.top)
     if fine is not None:
-        times, nominal = fine.times, fine.value / bowl[0]
-        spread = float(np.sqrt(bowl[1] ** 2 + fine.sigma**2 + SHAPE_SIGMA**2))
-        base = _wheelbase(times, nominal)
-        speed = _posterior(nominal, base, (nominal, spread), limits)
+        nominal = fine.value / shown.bowl[0]
+        spread = float(np.sqrt(shown.bowl[1] ** 2 + fine.sigma**2 + SHAPE_SIGMA**2))
+        stand = bogies(fine.times)
+        if not _BASES[0] < stand.base * nominal < _BASES[1]:
+            stand = Bogies()
+        speed = _posterior(nominal, stand, (nominal, spread), limits)
         method = "wheelbase and bowl of the deflection"
-    elif best.base[2] > _PAIRED:
-        base = best.base
-        speed = _posterior(WHEELBASES[0][1] / base[0], base, None, limits)
+    elif best.bogies.clear:
+        stand = best.bogies
+        speed = _posterior(stand.speeds()[0], stand, None, limits)
         method = "typical wheelbase"
     else:
         return None
     place = float(np.median(best.found.sigma)) * speed[0] / best.speed
-    return _result(times, place, speed, best.found, fine, base[2], method)
+    times = best.times if fine is None else fine.times
+    return _result(times, place, speed, best.found, fine, stand, method)
+
+
+def _bowl(shown: Shown, best: _Trial) -> Corner | None:
+    """The corner of the deflection by the wheelsets of a trial; ``None`` if they do not show it.
+
+    Waves shorter than the bowl, of roughness and sleepers, have a corner of their own: it is looked
+    for about the speeds that the wheelbase allows, the nearest to what is known of the site kept.
+    """
+    if best.corner is None:
+        return None
+    spread = float(np.hypot(shown.bowl[1], SHAPE_SIGMA))
+    found: list[tuple[float, Corner]] = []
+    for (share, _, _), speed in zip(
+        WHEELBASES if best.bogies.clear else ((1.0, 0.0, 0.0),),
+        best.bogies.speeds() or [best.speed],
+        strict=True,
+    ):
+        fine = _refined(shown.wave, best.times, WAVENUMBER * speed)
+        if fine is not None:
+            off = float(np.log(fine.value / (shown.bowl[0] * speed))) / spread
+            found.append((float(np.log(share)) - 0.5 * off**2, fine))
+    return max(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def _refined(wave: Wave, times: Array, first: float) -> Corner | None:
+    """The corner about a first guess (rad/s), with places and loads of all wheelsets, or with the
+    loads alone at the places that were found."""
+    for unknowns in (2, 1):
+        trial = corner(wave, times, first, refits=unknowns - 1)
+        trial = trial and corner(wave, trial.times, trial.value, refits=unknowns - 1)
+        if trial is not None and trial.worth(unknowns) > 0:
+            return trial
+    return None
 
 
 def _result(
@@ -365,7 +431,7 @@ def _result(
     speed: tuple[float, float, tuple[float, float]],
     found: Wheelsets,
     fine: Corner | None,
-    paired: float,
+    stand: Bogies,
     method: str,
 ) -> Single:
     middle = 0.5 * float(times[0] + times[-1])
@@ -380,6 +446,6 @@ def _result(
         certainty=found.certainty,
         contrast=found.contrast,
         corner=fine,
-        paired=paired,
+        bogies=stand,
         method=method,
     )

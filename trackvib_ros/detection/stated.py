@@ -70,6 +70,8 @@ def speed(passage: Passage) -> Speed:
     else:
         related = ("scaled", "varied")
         meant = [part(e.probability, e.motion) for e in passage.explanations if e.kind in related]
+        # a type may be refused by what its pattern does not show
+        meant = meant if sum(w for w, _, _ in meant) > 0 else parts
         if len(passage.traces) == 1:
             # nothing fixes the size of what the listed types only resemble
             parts = [(w, v, float(np.hypot(s, _SIZE * v))) for w, v, s in parts]
@@ -125,9 +127,11 @@ def wheelsets(passage: Passage) -> tuple[Array, Array]:
     times = predicted + np.where(seen, trust * late, 0.0)
     here = np.maximum(motion.speed_at(times), 0.5)
     sigmas = np.hypot([motion.time_sigma(float(t)) for t in times], scatter / here)
-    return times, sigmas if passage.known else np.where(
-        seen, _unknown_place(passage) / here, sigmas
-    )
+    if passage.known:
+        return times, sigmas
+    start, end = passage.interval
+    outside = np.maximum(np.maximum(start - times, times - end), 0.0)
+    return times, np.hypot(np.where(seen, _unknown_place(passage) / here, sigmas), outside)
 
 
 def ends(passage: Passage, value: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -148,7 +152,10 @@ def ends(passage: Passage, value: float) -> tuple[tuple[float, float], tuple[flo
             )
         if not passage.known and best.fit.observed[0, i]:
             parts = [(1.0, float(best.fit.time[0, i]), _unknown_place(passage) / value)]
-        found.append((_mean(parts), _spread(parts, _mean(parts))))
+        time = _mean(parts)
+        # an unknown train ends where strong energy does rather than where another type would
+        missed = 0.0 if passage.known else time - passage.interval[i]
+        found.append((time, float(np.hypot(_spread(parts, time), missed))))
     return found[0], found[1]
 
 
