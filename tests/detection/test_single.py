@@ -8,6 +8,7 @@ from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
 from trackvib_ros.detection.bowl import corner, low_pass
 from trackvib_ros.detection.place import Wave
+from trackvib_ros.detection.single import bogies
 
 STEP = 0.001
 CAR = np.array([0.0, 2.5, 17.5, 20.0])
@@ -67,3 +68,29 @@ def test_an_unlisted_train_on_one_rail(speed, base, length):
     assert low < values["speed"].value < high
     times = 1e-9 * np.array([passage.stamp_ns, values["departure_ns"]])
     assert np.allclose(times, truth.axle_times(0.0)[[0, -1]], atol=0.15 / speed)
+
+
+@pytest.mark.parametrize("speed", [20.0, 60.0])
+def test_a_listed_type_of_the_same_proportions_is_not_named(speed):
+    listed, passing = (Catalogue.default()[name] for name in ("metro_A6", "metro"))
+    truth = Passage(passing.axles, speed)
+    rate, x = record([truth], RAILS[:1], 15, kind="pulse", rates={"rail": 2000})["rail_a"]
+    only = Catalogue((listed,), "cars a sixth longer than those that pass")
+    (passage,) = (e for e in detect(rate, x, RAILS[0], only) if e.kind == "passage")
+    values = passage.values
+    assert values["type"] == "unknown"
+    assert abs(values["speed"].value - speed) < 2.5 * values["speed"].sigma
+    ends = truth.axle_times(0.0)[[0, -1]]
+    told = 1e-9 * np.array([values["arrival_ns"], values["departure_ns"]])
+    sigma = np.array([values["arrival_sigma"], values["departure_sigma"]])
+    assert np.all(np.abs(told - ends) < 2.5 * sigma)
+
+
+@pytest.mark.parametrize("speed", [5.0, 110.0])
+def test_bogies_are_seen_whatever_the_speed(speed):
+    stand = bogies(PLACES / speed)
+    assert stand.clear and stand.share == 1.0
+    assert stand.base == pytest.approx(2.5 / speed)
+    assert stand.speeds()[0] == pytest.approx(speed)
+    even = bogies(np.arange(24) / speed)  # what is evenly spaced has none
+    assert not even.clear

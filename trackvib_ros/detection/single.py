@@ -4,6 +4,16 @@ On an axis of time without a scale the wheelsets are found for a few trial speed
 of the rail or in its energies. What they are apart in metres follows from three independent lengths
 that are known beforehand: the bowl of the deflection (:mod:`bowl`), the wheelbase of bogies, and
 the length of cars. Their product over a grid of speeds is the posterior of the speed.
+
+How well can that be known? A train of free places and loads gives the product k0 v (:mod:`bowl`)
+and the wheelbase in seconds, b / v, and nothing else in its record has a length. Noise apart, the
+Cramér-Rao bound of ln v is that of these two measurements with the priors of k0 and b,
+
+    sigma^-2 = (s_k² + s_s²)^-1 + (s_b / b)^-2,
+
+with s_k = 0.13 of k0 (pads), s_s = 0.04 of its shape and s_b / b = 0.25 / 2.5: 8 % on a site that
+has taught nothing (95 % within 16 %), 3.8 % where listed trains have taught k0 to 1 %. An error of
+2 % at 95 % is out of reach of one rail without a length that is known.
 """
 
 from __future__ import annotations
