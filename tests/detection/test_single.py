@@ -1,12 +1,16 @@
 """One rail and a train that no catalogue lists: its wheelsets, and a speed with an honest sigma."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import fft
 
 from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
+from trackvib_ros.detection.blind import Blind
 from trackvib_ros.detection.bowl import corner, low_pass
+from trackvib_ros.detection.kinematics import Motion
 from trackvib_ros.detection.place import Wave
 from trackvib_ros.detection.single import bogies
 
@@ -70,20 +74,28 @@ def test_an_unlisted_train_on_one_rail(speed, base, length):
     assert np.allclose(times, truth.axle_times(0.0)[[0, -1]], atol=0.15 / speed)
 
 
-@pytest.mark.parametrize("speed", [20.0, 60.0])
-def test_a_listed_type_of_the_same_proportions_is_not_named(speed):
-    listed, passing = (Catalogue.default()[name] for name in ("metro_A6", "metro"))
-    truth = Passage(passing.axles, speed)
-    rate, x = record([truth], RAILS[:1], 15, kind="pulse", rates={"rail": 2000})["rail_a"]
-    only = Catalogue((listed,), "cars a sixth longer than those that pass")
-    (passage,) = (e for e in detect(rate, x, RAILS[0], only) if e.kind == "passage")
-    values = passage.values
-    assert values["type"] == "unknown"
-    assert abs(values["speed"].value - speed) < 2.5 * values["speed"].sigma
-    ends = truth.axle_times(0.0)[[0, -1]]
-    told = 1e-9 * np.array([values["arrival_ns"], values["departure_ns"]])
-    sigma = np.array([values["arrival_sigma"], values["departure_sigma"]])
-    assert np.all(np.abs(told - ends) < 2.5 * sigma)
+def test_wheelsets_elsewhere_contradict_a_type():
+    motion = Motion(0.0, 0.0, 50.0, 0.0, np.zeros((3, 3)))
+    blind = Blind(
+        sensors=("rail_a",),
+        x=0.0,
+        motion=motion,
+        speed=(50.0, 4.0),
+        times=motion.time_at(PLACES),
+        time_sigma=np.full(PLACES.size, 1e-3),
+        regular=0.95,
+        direction=0,
+        correlation=0.0,
+        travels=True,
+        method="",
+    )
+    assert not blind.contradicts(PLACES + 0.3, motion)
+    moved = PLACES.copy()
+    moved[:2] += 3.0  # another first car
+    assert blind.contradicts(moved, motion)
+    assert blind.contradicts(PLACES[2:], motion) and blind.contradicts(PLACES[:-2], motion)
+    # what is in doubt itself contradicts nothing
+    assert not replace(blind, regular=0.5).contradicts(moved, motion)
 
 
 @pytest.mark.parametrize("speed", [5.0, 110.0])
