@@ -91,7 +91,7 @@ def test_wheelsets_elsewhere_contradict_a_type():
     )
     assert not blind.contradicts(PLACES + 0.3, motion)
     moved = PLACES.copy()
-    moved[:2] += 3.0  # another first car
+    moved[:2] += 5.0  # another first bogie
     assert blind.contradicts(moved, motion)
     assert blind.contradicts(PLACES[2:], motion) and blind.contradicts(PLACES[:-2], motion)
     # what is in doubt itself contradicts nothing
