@@ -118,11 +118,10 @@ class ResponsePassage:
         unit = tempered(top)
         listed = sum(np.exp((fit.evidence - top) / unit) for fit in self.fits) / self.types
         gain = (self.unlisted.evidence - top) / unit + self.choice - np.log(NUMBERS_APART * listed)
-        if self.types > 1:
-            top = max((fit.common or fit).evidence for fit in self.fits)
-            common = (self.unlisted.common or self.unlisted).evidence
-            plain = (common - top) / tempered(top, False) - np.log(ALTERNATIVES)
-            gain = max(gain, plain)
+        top = max((fit.common or fit).evidence for fit in self.fits)
+        common = (self.unlisted.common or self.unlisted).evidence
+        plain = (common - top) / tempered(top, False) - np.log(ALTERNATIVES)
+        gain = max(gain, plain) if self.types > 1 else min(gain, plain)
         odds = PRIOR_UNKNOWN / (1 - PRIOR_UNKNOWN) * np.exp(min(gain, 50.0))
         return float(odds / (1 + odds))
 
