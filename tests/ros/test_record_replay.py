@@ -24,6 +24,7 @@ from std_msgs.msg import String
 
 from solver import InputError
 from tests.bag import sample
+from tests.ros.harness import own_domain
 from trackvib_ros.bag import BagReader, BagWriter
 from trackvib_ros.cli import main
 from trackvib_ros.outbox import RCLError
@@ -39,12 +40,7 @@ BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 @pytest.fixture
 def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    number = 61 + int(worker.removeprefix("gw")) % 10
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_PYTHON_CHECK_FIELDS", "1")
-    return number
+    return own_domain(monkeypatch, offset=6)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import travel
-from .calibration import POSITION_SIGMA, Calibration
+from .calibration import Calibration
 from .kinematics import Motion
 from .place import Wave, likelihood, locate
 from .record import Record
@@ -119,15 +119,12 @@ def describe(
 
 
 def at_site(blind: Blind, site: Calibration) -> Blind:
-    """With what is known of the distance between the two channels, learned or doubted.
-
-    A centimetre of the tape is in the speed already.
-    """
+    """With what is known of the distance between the two channels, learned or doubted."""
     if len(blind.sensors) < 2:
         return blind
     offset, covariance = site.relative(blind.sensors)
-    doubt = max(float(covariance[1, 1]) - 2 * POSITION_SIGMA**2, 0.0) ** 0.5
-    factor, relative = 1 + float(offset[1]) / blind.baseline, doubt / blind.baseline
+    factor = 1 + float(offset[1]) / blind.baseline
+    relative = float(covariance[1, 1]) ** 0.5 / blind.baseline
     motion, (speed, sigma) = blind.motion, blind.speed
     scaled = factor**2 * motion.covariance
     scaled[1, 1] += (relative * motion.speed) ** 2
@@ -214,7 +211,7 @@ def _two_channels(
     start = float(pair.axis(found.motion, found.direction)[0]) + 0.5 * travel.CELL
     motion, places, place_sigma = _placed(a, b, found, start + wheelsets.place)
     times = motion.time_at(places)
-    middle = 0.5 * float(times[0] + times[-1])
+    middle = float(motion.time_at(0.5 * float(places[0] + places[-1])))
     speed = float(motion.speed_at(middle))
     near = np.diff(wheelsets.place) < _PARTNER
     paired = np.append(near, False) | np.append(False, near)
