@@ -114,10 +114,12 @@ def test_an_unlisted_train_is_as_fast_as_the_distance_is_long():
     blind = Blind(NAMES, 0.0, motion, (40.0, 0.1), seen, 0 * seen, 0.9, 1, 0.9, True, "delay",
                   baseline=20.0)  # fmt: skip
     told = at_site(blind, Calibration.untaught(CHANNELS, 0.5))
-    relative = (2 * 0.5**2 - 2 * POSITION_SIGMA**2) ** 0.5 / 20.0
+    relative = (2 * 0.5**2) ** 0.5 / 20.0
     assert told.speed == pytest.approx((40.0, np.hypot(0.1, 40.0 * relative)), rel=1e-12)
     assert told.motion.speed_sigma(0.0) == pytest.approx(told.speed[1], rel=1e-12)
-    assert at_site(blind, Calibration.untaught(CHANNELS, POSITION_SIGMA)).speed == blind.speed
+    told = at_site(blind, Calibration.untaught(CHANNELS))
+    tape = 2**0.5 * POSITION_SIGMA / 20.0
+    assert told.speed == pytest.approx((40.0, np.hypot(0.1, 40.0 * tape)), rel=1e-12)
     # a metre more, as five passages have taught, makes everything longer and faster
     state = Calibration.untaught(CHANNELS, 0.5)
     for _ in range(5):
