@@ -51,6 +51,7 @@ _RECURSIVE = np.array([1.0, 0.0])  # keeps lfilter from convolving, whose roundi
 _FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
 _MEAN_S = 0.06  # before a long hole, half the memory of the lowest band's high-pass
 _SETTLE_S = 0.05  # bins after a hole that the filters still remember
+_BRIDGED_S = 0.015  # after a hole that is interpolated; exp(-2 pi 100 Hz t) is 1e-4
 _MAX_GAP_S = 5.0  # longer gaps restart the stream
 
 
@@ -84,6 +85,18 @@ class Window:
     shift: Array
     low_shift: float
     bands: tuple[tuple[float, float], ...]
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Bins that nothing but measured samples made.
+
+        Between two samples of a strong vibration a short hole is bridged by a slow wave that is not
+        there. Where such holes leave less than half of what is valid, they count as measured.
+        """
+        after = round(_BRIDGED_S / self.step)
+        lost = np.cumsum(np.concatenate([np.zeros(after + 1), self.holes > 0]))
+        kept = self.valid & (lost[after + 1 :] == lost[: -after - 1])
+        return np.asarray(kept if 2 * kept.sum() > self.valid.sum() else self.valid)
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,9 @@ def scan_channel(
     whole = record.traces(within)
     window = record.window
     inside = (window.time >= within[0]) & (window.time <= within[1])
-    wave = Wave(window.time - window.low_shift, window.low, window.valid, clipped(window, inside))
+    wave = Wave(
+        window.time - window.low_shift, window.low, window.measured, clipped(window, inside)
+    )
     for trace, limited, band in zip(
         whole, record.traces(within, limited=True), window.bands, strict=True
     ):

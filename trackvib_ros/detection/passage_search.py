@@ -120,7 +120,7 @@ def bowl_of(record: Record, passage: Passage) -> Corner | None:
     """
     best = passage.hypotheses[0]
     window = record.window
-    wave = Wave(window.time - window.low_shift, window.low, window.valid)
+    wave = Wave(window.time - window.low_shift, window.low, window.measured)
     if best.probability < CERTAIN:
         return None
     apart = passage.direction * (record.channel.x - passage.traces[0].x)

@@ -48,6 +48,7 @@ _FINE_STEP = 0.05  # m, for the shortest of these waves
 _GROUPS = ((1.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0), (25.0, 30.0))
 _PULSE = np.arange(-2.0, 2.01, 1.0)  # m about a wheelset; as dense as the width of a group asks for
 _ROUNDS = 2
+_COMPLETIONS = 4  # of holes; each leaves of the error what is missing, a fifth
 _IN_DOUBT = 1.0  # rad, standard deviation of a phase that is within half a turn at three
 _CHANGE = 0.3  # m, within which the motion is known already
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
@@ -76,10 +77,72 @@ class Wave:
     clipped: bool = False
 
 
-def _against_distance(
-    wave: Wave, motion: Motion, length: float, step: float
-) -> tuple[Array, float] | None:
-    """Mean value per cell of distance from ``-_TAPER`` on, tapered, and the measured fraction."""
+@dataclass
+class _Course:
+    """Waveform of a channel against distance, in cells from ``_TAPER`` before a train on.
+
+    Attributes:
+        cell: mean value of every cell, tapered towards both ends.
+        known: cells without a hole of the record.
+        step: length of a cell (m).
+        measured: fraction of the samples.
+        size: of the transform.
+        low: number of the first wavenumber in use.
+        k: wavenumbers in use (rad/m).
+    """
+
+    cell: Array
+    known: NDArray[np.bool_]
+    step: float
+    measured: float
+    size: int
+    low: int
+    k: Array
+
+    def __post_init__(self) -> None:
+        self._origin = np.exp(1j * self.k * (_TAPER - 0.5 * self.step))
+        self._holes = np.flatnonzero(~self.known)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing is missing."""
+        return self._holes.size == 0
+
+    def seen(self, model: Any = None) -> Any:
+        """Transform at ``k``; holes hold what pulses do, and what they leave on either side.
+
+        With missing data so completed, the least squares of all data lead to those of the measured
+        ones (Dempster, Laird & Rubin, J. Royal Statistical Society B 39, 1977).
+
+        The first pulses, of holes that hold none, are as much too small as is missing.
+
+        Args:
+            model: transform of the pulses, by ``k``; none at first.
+        """
+        full = self.cell
+        if not self.whole:
+            full = full.copy()
+            pulses = np.zeros(full.size)
+            if model is not None:
+                table = np.zeros(self.size // 2 + 1, dtype=np.complex128)
+                table[self.low : self.low + self.k.size] = model / self._origin
+                pulses = fft.irfft(table, self.size)[: full.size]
+            at = np.flatnonzero(self.known)
+            between = np.interp(self._holes, at, full[at] - pulses[at])
+            full[self._holes] = pulses[self._holes] + between
+        part = fft.rfft(full, self.size)[self.low : self.low + self.k.size]
+        return part * self._origin
+
+
+def _course(
+    wave: Wave, motion: Motion, places: Array, top: float | None, step: float
+) -> _Course | None:
+    """Waveform of a channel against distance from the first wheelset on, if there is any."""
+    start, length = float(places[0]), float(places[-1] - places[0])
+    speed = _mid_speed(motion, places)
+    if not (np.isfinite(length) and length > 0 and speed > 0):
+        return None
+    motion = _from(motion, start)
     count = int(np.ceil((length + 2 * _TAPER) / step))
     edges: Array = -_TAPER + step * np.arange(count + 1, dtype=np.float64)
     times = motion.time_at(edges)
@@ -88,15 +151,30 @@ def _against_distance(
     valid = wave.valid[first:last]
     if valid.sum() < 16:
         return None
-    time, known = wave.time[first:last], np.flatnonzero(valid)
-    value = np.interp(np.arange(valid.size), known, wave.value[first:last][known])
+    time, measured = wave.time[first:last], np.flatnonzero(valid)
+    value = np.interp(np.arange(valid.size), measured, wave.value[first:last][measured])
     total = np.concatenate([[0.0], np.cumsum(0.5 * (value[1:] + value[:-1]) * np.diff(time))])
     # mean over the cell's time: to first order that over its distance
     cell = np.diff(np.interp(times, time, total)) / np.maximum(np.diff(times), 1e-9)
+    lost = np.concatenate([[0.0], np.cumsum(~valid)])
+    ends = np.searchsorted(time, times)
+    known = lost[np.minimum(ends[1:] + 1, valid.size)] == lost[np.maximum(ends[:-1] - 1, 0)]
+    if not known.any():
+        return None
     ramp = np.minimum(1.0, (np.arange(count) + 0.5) * step / _TAPER)
     taper = np.sin(0.5 * np.pi * ramp) ** 2
     taper *= taper[::-1]
-    return (cell - np.sum(cell * taper) / taper.sum()) * taper, float(valid.mean())
+    size = fft.next_fast_len(4 * count // 3, real=True)
+    k = 2 * np.pi * fft.rfftfreq(size, step)
+    spacing = float(np.median(np.diff(wave.time)))
+    top = min(top or _WAVENUMBERS[1], 2 * np.pi / (_SAMPLES * spacing * speed))
+    low, high = (int(i) for i in np.searchsorted(k, [_WAVENUMBERS[0], top]))
+    if high - low < 8:
+        return None
+    cell = (cell - np.sum(cell * taper) / taper.sum()) * taper
+    if not np.any(cell):
+        return None
+    return _Course(cell, known, step, float(valid.mean()), size, low, k[low:high])
 
 
 def likelihood(wave: Wave, motion: Motion, places: Array) -> Array:
@@ -154,26 +232,28 @@ class _Group:
     """Neighbouring wavenumbers of a channel.
 
     Attributes:
-        first, step: wavenumbers (rad/m).
-        seen: transform of the waveform there.
-        share: independent wavenumbers per wavenumber.
+        course: waveform of the channel.
+        part: of its wavenumbers.
         at: places of the wheelsets (m).
-        shown: part of every wheelset that was measured.
+        seen: transform of the waveform there.
         log: likelihood of the pulse against noise.
+        pulses: what is expected of the pulses there.
     """
 
-    first: float
-    step: float
-    seen: Any
-    share: float
+    course: _Course
+    part: slice
     at: Array
-    shown: Array
+    seen: Any
     log: float = 0.0
 
     def __post_init__(self) -> None:
-        bands = max(1, round(self.seen.size * self.step / _BAND))
-        self._band = np.arange(self.seen.size) * bands // self.seen.size
+        k = self.course.k[self.part]
+        self._first, self._step = float(k[0]), float(k[1] - k[0])
+        bands = max(1, round(k.size * self._step / _BAND))
+        self._band = np.arange(k.size) * bands // k.size
+        self._share = _independent(self.course) / self.course.k.size
         self._alone, self._weight = self._noise(self.seen)
+        self.pulses = np.zeros_like(self.seen)
 
     def explained(self, change: Array) -> tuple[Array, Array]:
         """What the waveform says of a change (m): normal matrix and right-hand side.
@@ -183,19 +263,22 @@ class _Group:
         along = 2 * (self.at - self.at[0]) / (self.at[-1] - self.at[0]) - 1
         bend = np.stack([np.ones_like(along), along, 0.5 * along**2])
         ahead = self.at - self.at[0] + change @ bend[1:]
-        k, phases = _phases(self.first, self.step, self.seen.size, ahead)
-        comb, *slopes = (self.shown * bend) @ phases
+        k, phases = _phases(self._first, self._step, self.seen.size, ahead)
+        comb, *slopes = bend @ phases
         pulse = np.exp(-1j * np.outer(_PULSE, k))
         taps = pulse * comb
         left, pulled = self._reduced(taps, self.seen[None])
         level, self._weight = self._noise(left[0])
         # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
-        self.log = level - self._alone - _PULSE.size * float(np.log(2 * self.share * k.size))
+        cost = _PULSE.size * float(np.log(2 * self._share * k.size))
+        self.log = level - self._alone - cost
+        begun = bool(np.any(self.pulses))
+        self.pulses = (pulled[0] @ taps) / (1.0 if begun else self.course.measured)
         slope = (pulled[0] @ pulse) * -1j * k * np.array(slopes)
         slope, _ = self._reduced(taps, slope)
         # the second derivative of the likelihood: the weight less by how it falls with the rest
         bent = self._weight * (
-            1 - self._weight * np.abs(left[0]) ** 2 / (2 * self.share * (_LINES + 1))
+            1 - self._weight * np.abs(left[0]) ** 2 / (2 * self._share * (_LINES + 1))
         )
         normal = np.real((slope * bent).conj() @ slope.T)
         return normal, np.real((slope * self._weight).conj() @ left[0])
@@ -216,7 +299,8 @@ class _Group:
             level = level * np.bincount(self._band, weight * power) / count + least
         own = level[self._band]
         log = -np.log(own) - (_LINES + 1) * np.log1p(power / (_LINES * own))
-        return self.share * float(log.sum()), 2 * self.share * (_LINES + 1) / (_LINES * own + power)
+        weight = 2 * self._share * (_LINES + 1) / (_LINES * own + power)
+        return self._share * float(log.sum()), weight
 
     def _reduced(self, taps: Any, rows: Any) -> tuple[Any, Any]:
         """Rows less what of them pulses explain, and these pulses."""
@@ -255,36 +339,41 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
         motion: of the train.
         places: of its wheelsets (m), per channel, as for :func:`likelihood`.
     """
-    stages: list[list[_Group]] = [[] for _ in _GROUPS]
+    courses: list[tuple[_Course, Array]] = []
     for wave, at in zip(waves, places, strict=True):
-        found = spectrum(wave, motion, at, _GROUPS[-1][1], _FINE_STEP)
-        if found is None:
-            continue
-        k, seen, independent = found
-        step = float(k[1] - k[0])
-        shown = _shown(wave, motion, at)
-        for stage, (low, high) in zip(stages, _GROUPS, strict=True):
-            part = slice(*(int(i) for i in np.searchsorted(k, [low, high])))
-            if (part.stop - part.start) * step > 0.5 * (high - low):
-                share = independent / k.size
-                stage.append(_Group(float(k[part.start]), step, seen[part], share, at, shown))
+        course = _course(wave, motion, at, _GROUPS[-1][1], _FINE_STEP)
+        if course is not None:
+            courses.append((course, at))
+    model = [np.zeros(course.k.size, dtype=np.complex128) for course, _ in courses]
+    seen = [course.seen() for course, _ in courses]
     change, normal, right = np.zeros(2), np.diag([_CHANGE**-2] * 2), np.zeros(2)
     asked: list[_Group] = []
-    for stage, (_, high) in zip(stages, _GROUPS, strict=True):
+    for low, high in _GROUPS:
         ends = np.array([[1.0, 0.5], [-1.0, 0.5]])
         doubt = high * float(np.sqrt(np.max(np.sum(ends @ np.linalg.inv(normal) * ends, axis=1))))
         if asked and doubt > _IN_DOUBT:
             break
+        stage: list[tuple[int, _Group]] = []
+        for i, (course, at) in enumerate(courses):
+            part = slice(*(int(j) for j in np.searchsorted(course.k, [low, high])))
+            if (part.stop - part.start) * (course.k[1] - course.k[0]) > 0.5 * (high - low):
+                stage.append((i, _Group(course, part, at, seen[i][part])))
         before = normal, right
-        for _ in range(_ROUNDS if stage else 0):
+        whole = all(group.course.whole for _, group in stage)
+        for _ in range((_ROUNDS if whole else _COMPLETIONS) if stage else 0):
             normal, right = before
-            for group in stage:
+            for _, group in stage:
                 more, pull = group.explained(change)
                 normal = normal + expit(group.log) * more
                 right = right + expit(group.log) * (pull + more @ change)
             more_change = np.linalg.solve(normal, right) - change
             change = change + np.clip(more_change, -1 / high, 1 / high)
-        asked += stage
+            for i, group in stage:
+                if not group.course.whole:
+                    model[i][group.part] = group.pulses
+                    seen[i] = group.course.seen(model[i])
+                    group.seen = seen[i][group.part]
+        asked += [group for _, group in stage]
     for group in asked:
         group.explained(change)
     log = sum(float(np.logaddexp(0.0, group.log)) - float(np.log(2)) for group in asked)
@@ -306,33 +395,27 @@ def spectrum(
         top: largest wavenumber (rad/m) instead of that of a deflection.
         step: cell of distance (m).
     """
-    start, length = float(places[0]), float(places[-1] - places[0])
-    if not (np.isfinite(length) and length > 0 and _mid_speed(motion, places) > 0):
+    course = _course(wave, motion, places, top, step)
+    if course is None:
         return None
-    found = _against_distance(wave, _from(motion, start), length, step)
-    if found is None:
-        return None
-    cells, measured = found
-    size = fft.next_fast_len(4 * cells.size // 3, real=True)
-    k = 2 * np.pi * fft.rfftfreq(size, step)
-    spacing = float(np.median(np.diff(wave.time)))
-    top = min(top or _WAVENUMBERS[1], 2 * np.pi / (_SAMPLES * spacing * _mid_speed(motion, places)))
-    use = (k >= _WAVENUMBERS[0]) & (k <= top)
-    if use.sum() < 8:
-        return None
-    k = k[use]
-    origin = -_TAPER + 0.5 * step
-    seen = fft.rfft(cells, size)[use] * np.exp(-1j * k * origin)
-    if not np.any(seen):
-        return None
-    return k, seen, cells.size * step * (k[-1] - k[0]) / (2 * np.pi) * measured
+    seen = course.seen()
+    independent = _independent(course)
+    if not course.whole:
+        k, at = course.k, places - places[0]
+        _, phases = _phases(float(k[0]), float(k[1] - k[0]), k.size, at)
+        taps = np.exp(-1j * np.outer(_PULSE, k)) * phases.sum(axis=0)
+        normal = np.real(taps.conj() @ taps.T)
+        normal += 1e-9 * np.trace(normal) * np.eye(len(taps))
+        for share in (course.measured, *[1.0] * (_COMPLETIONS - 1)):
+            shape = np.linalg.solve(normal, np.real(taps.conj() @ seen))
+            seen = course.seen(shape @ taps / share)
+    return course.k, seen, independent
 
 
-def _shown(wave: Wave, motion: Motion, places: Array) -> Array:
-    """Measured part of the metre on either side of every wheelset."""
-    total = np.concatenate([[0.0], np.cumsum(wave.valid)])
-    ends = np.searchsorted(wave.time, motion.time_at(np.stack([places - 1.0, places + 1.0])))
-    return np.asarray((total[ends[1]] - total[ends[0]]) / np.maximum(ends[1] - ends[0], 1))
+def _independent(course: _Course) -> float:
+    """Number of independent wavenumbers."""
+    length = course.cell.size * course.step
+    return float(length * (course.k[-1] - course.k[0]) / (2 * np.pi) * course.measured)
 
 
 def _from(motion: Motion, start: float) -> Motion:

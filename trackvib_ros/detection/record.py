@@ -39,7 +39,7 @@ class Record:
                 self.channel.x,
                 window.time - window.shift[b],
                 window.energy[:, b],
-                window.valid,
+                window.measured,
                 float(self.floor[b]),
                 window.step,
                 (within[0] - 0.3, within[1] + 0.3),

@@ -120,7 +120,7 @@ class Shown:
     def wave(self) -> Wave:
         """The waveform below 100 Hz."""
         window = self.record.window
-        return Wave(window.time - window.low_shift, window.low, window.valid)
+        return Wave(window.time - window.low_shift, window.low, window.measured)
 
     @property
     def quiet(self) -> float:

@@ -98,9 +98,9 @@ def deflection(window: Window, within: tuple[float, float]) -> Series:
     """The waveform below 100 Hz, its mean removed, zero outside an interval (s)."""
     time = window.time - window.low_shift
     inside = (time >= within[0]) & (time <= within[1])
-    good = inside & window.valid
+    good = inside & window.measured
     middle = float(np.median(window.low[good])) if good.any() else 0.0
-    return Series(time, np.where(inside, window.low - middle, 0.0), window.valid | ~inside)
+    return Series(time, np.where(inside, window.low - middle, 0.0), window.measured | ~inside)
 
 
 @dataclass(frozen=True)
