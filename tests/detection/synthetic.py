@@ -123,6 +123,32 @@ def _bridge(passage: Passage, channel: Channel, time: Array, rate: float) -> Arr
     return out / 4
 
 
+def flat_blows(
+    passage: Passage,
+    channel: Channel,
+    time: Array,
+    rate: float,
+    wheelsets: Sequence[int],
+    amplitude: float,
+) -> Array:
+    """Hits of flat wheels: every 2.9 m of way, heard 1 dB weaker a metre, 2 ms at 300 Hz."""
+    out = np.zeros(time.size)
+    s = passage.distance(time)
+    for number in wheelsets:
+        place = s - passage.axles[number]  # of the wheelset along the track
+        for k in range(-14, 15):
+            at = 2.9 * (k + 0.37 * number % 1)
+            i = int(np.searchsorted(place, at))
+            if not 0 < i < time.size:
+                continue
+            near = 10 ** (-abs(at - passage.direction * channel.x) / 20)
+            t = np.arange(int(0.02 * rate)) / rate
+            blow = amplitude * near * np.exp(-t / 2e-3) * np.sin(2 * np.pi * 300 * t)
+            part = out[i : i + t.size]
+            part += blow[: part.size]
+    return out
+
+
 def record(
     passages: Sequence[Passage],
     channels: Sequence[Channel] = RAILS,

@@ -13,6 +13,7 @@ from tests.detection.synthetic import (
     RAILS,
     Passage,
     blocks,
+    flat_blows,
     nuisance,
     record,
 )
@@ -188,25 +189,6 @@ def test_clipping_at_a_fifth_of_the_peak():
     # bursts without a deflection: CRH2, 0.9 % larger, may not be told from CRH3
     speed = passage.values["speed"]
     assert abs(speed.value - 60.0) < 2.2 * speed.sigma < 2.2 * 60.0 * 0.009
-
-
-def flat_blows(passage, channel, time, rate, wheelsets, amplitude):
-    """Hits of flat wheels: every 2.9 m of way, heard 1 dB weaker a metre, 2 ms at 300 Hz."""
-    out = np.zeros(time.size)
-    s = passage.distance(time)
-    for number in wheelsets:
-        place = s - passage.axles[number]  # of the wheelset along the track
-        for k in range(-14, 15):
-            at = 2.9 * (k + 0.37 * number % 1)
-            i = int(np.searchsorted(place, at))
-            if not 0 < i < time.size:
-                continue
-            near = 10 ** (-abs(at - passage.direction * channel.x) / 20)
-            t = np.arange(int(0.02 * rate)) / rate
-            blow = amplitude * near * np.exp(-t / 2e-3) * np.sin(2 * np.pi * 300 * t)
-            part = out[i : i + t.size]
-            part += blow[: part.size]
-    return out
 
 
 @pytest.mark.parametrize("kmh", [65, 150, 290])

@@ -92,6 +92,7 @@ class Passage:
         baseline: learned correction of the distance between the outer two channels that was
             used (m), sigma, passages it was learned from; or None.
         contradicted: whether wheelsets that were found without a type are not those of the best.
+        struck: whether blows hide its wheelsets, of which only the sum shows the type.
     """
 
     interval: tuple[float, float]
@@ -108,6 +109,7 @@ class Passage:
     coarse_score: float = 0.0
     blind: Blind | None = None
     contradicted: bool = False
+    struck: bool = False
 
     @property
     def score(self) -> float:
@@ -122,6 +124,8 @@ class Passage:
     @property
     def known(self) -> bool:
         """Whether a catalogue type explains the pattern."""
+        if self.struck:
+            return True
         if self.contradicted or not self._patterned(KNOWN_SCORE) or self.unknown >= 0.5:
             return False
         return self._covered and not (self.alone and self._doubted(UNLIKE))
@@ -162,6 +166,8 @@ class Passage:
     @property
     def confirmed(self) -> bool:
         """Whether this is a train: by its pattern, or by what two channels agree on."""
+        if self.struck:
+            return True
         # a pattern that no type explains, at channels that contradict each other, is chance
         if self._patterned(CONFIRM_SCORE) and (self.known or not self.clock_offset):
             return True

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .blind import at_site, describe, describe_alone
+from . import struck
+from .blind import CONFIDENT, at_site, describe, describe_alone
 from .bowl import WAVENUMBER, Corner, corner
 from .calibration import Calibration
 from .catalogue import Catalogue, TrainType
@@ -103,6 +104,9 @@ def find_passages(
     if whole is None:
         return []
     found = _divided(rails, within, whole, catalogue, limits, site, unlisted, depth=3)
+    if unlisted and len(rails) > 1 and not any(p.known or _counted(p) for p in found):
+        hidden = struck.find(rails, within, catalogue.types, limits)
+        return found if hidden is None else [hidden]
     if len(rails) > 1 or not unlisted:
         return found
     return [
@@ -111,6 +115,12 @@ def find_passages(
         else _described(rails[0], within, p, limits, site)
         for p in found
     ]
+
+
+def _counted(passage: Passage) -> bool:
+    """Whether the wheelsets of a train of no listed type were seen."""
+    blind = passage.blind
+    return blind is not None and blind.travels and blind.regular >= CONFIDENT
 
 
 def bowl_of(record: Record, passage: Passage) -> Corner | None:

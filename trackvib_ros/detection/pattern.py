@@ -280,7 +280,7 @@ def _grid(low: float, high: float, step: float) -> Array:
     return np.geomspace(low, high, count)
 
 
-def _accelerations(duration: float, step_m: float) -> Array:
+def accelerations(duration: float, step_m: float) -> Array:
     """Accelerations whose bend over the duration differs by ``step_m`` (m) at the ends."""
     step = 32 * step_m / duration**2
     count = int(MAX_ACCELERATION / step)
@@ -323,7 +323,7 @@ def scan(
     low = min(r[0] for r in ranges)
     high = max(r[1] for r in ranges)
     best: dict[tuple[str, bool], Match] = {}
-    for acceleration in _accelerations(duration, _COARSE_BEND):
+    for acceleration in accelerations(duration, _COARSE_BEND):
         for match in _scan_once(
             traces,
             epoch,
@@ -350,7 +350,7 @@ def refine(
     if not matches:
         return []
     duration = max(interval[1] - interval[0], 0.2)
-    bends = _accelerations(duration, _COARSE_BEND)
+    bends = accelerations(duration, _COARSE_BEND)
     bend = float(bends[1] - bends[0]) if bends.size > 1 else 0.0
     near = [m for m in matches if m.score > matches[0].score - 0.25][:keep]
     return sorted((_refine(traces, m, duration, bend) for m in near), key=lambda m: -m.score)
