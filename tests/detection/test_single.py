@@ -75,12 +75,14 @@ def test_an_unlisted_train_on_one_rail(speed, base, length):
 
 
 def test_wheelsets_elsewhere_contradict_a_type():
-    motion = Motion(0.0, 0.0, 50.0, 0.0, np.zeros((3, 3)))
+    speed = 50.0
+    wave = bowls(1.8, speed, 0.3, np.random.default_rng(2))
+    motion = Motion(1.0, 0.0, speed, 0.0, np.zeros((3, 3)))
     blind = Blind(
         sensors=("rail_a",),
         x=0.0,
         motion=motion,
-        speed=(50.0, 4.0),
+        speed=(speed, 4.0),
         times=motion.time_at(PLACES),
         time_sigma=np.full(PLACES.size, 1e-3),
         regular=0.95,
@@ -89,13 +91,18 @@ def test_wheelsets_elsewhere_contradict_a_type():
         travels=True,
         method="",
     )
-    assert not blind.contradicts(PLACES + 0.3, motion)
+    assert not blind.contradicts(PLACES + 0.3, motion, wave)
     moved = PLACES.copy()
     moved[:2] += 5.0  # another first bogie
-    assert blind.contradicts(moved, motion)
-    assert blind.contradicts(PLACES[2:], motion) and blind.contradicts(PLACES[:-2], motion)
+    assert blind.contradicts(moved, motion, wave)
+    assert blind.contradicts(PLACES[2:], motion, wave)
+    assert blind.contradicts(PLACES[:-2], motion, wave)
     # what is in doubt itself contradicts nothing
-    assert not replace(blind, regular=0.5).contradicts(moved, motion)
+    assert not replace(blind, regular=0.5).contradicts(moved, motion, wave)
+    # nor do bogies that were missed, where a type explains the deflection with them
+    for k in (0, 8, PLACES.size - 2):
+        fewer = replace(blind, times=np.delete(blind.times, [k, k + 1]))
+        assert not fewer.contradicts(PLACES, motion, wave)
 
 
 @pytest.mark.parametrize("speed", [5.0, 110.0])

@@ -13,7 +13,7 @@ from .calibration import Calibration
 from .kinematics import Motion
 from .place import Wave, likelihood, locate
 from .record import Record
-from .single import HUMP, HUMP_FINE, Shown, alone, log_energy
+from .single import HUMP, HUMP_FINE, Shown, alone, compared, log_energy
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -33,6 +33,7 @@ _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
 _LEAST_WORTH = 25.0  # e^25 outweighs the speeds and pulses tried, as for two channels
 _LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right than wrong
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
+_BOGIE = 2  # wheelsets
 _CARRIED = 4.0  # m, strong energy before the first wheelset and behind the last (0 to 3.4 m)
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
@@ -82,19 +83,35 @@ class Blind:
         """Distances between successive wheelsets (m)."""
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
 
-    def contradicts(self, places: Array, motion: Motion) -> bool:
+    def contradicts(self, places: Array, motion: Motion, wave: Wave) -> bool:
         """Whether a bogie or more of this train, beyond doubt, is not where a type has one.
+
+        Of wheelsets that only one of the two has, those of this train must explain more of the
+        deflection than their places and loads cost (two unknowns each, Bayesian information), or
+        those of the type less than their loads do: else they were missed, or found by chance.
 
         Args:
             places: of the type's wheelsets, in order (m).
             motion: of the type past the reference point.
+            wave: low-passed waveform of the channel.
         """
         if not self.travels or self.regular < CONFIDENT:
             return False
         own = motion.distance_at(self.times)
         apart = np.abs(own[:, None] - places[None, :])
-        elsewhere = max(int(np.sum(apart.min(axis=k) > _ELSEWHERE)) for k in (0, 1))
-        return elsewhere >= 2
+        own, listed = own[apart.min(axis=1) > _ELSEWHERE], apart.min(axis=0) <= _ELSEWHERE
+        more, fewer = own.size, int(np.sum(~listed))
+        every = np.sort(np.append(places, own))
+        first, last = motion.time_at(every[[0, -1]])
+        cost = 0.5 * float(np.log(every.size))
+
+        def gain(at: Array) -> float:
+            fine = compared(wave, motion.time_at(at), motion.speed, (float(first), float(last)))
+            return -np.inf if fine is None else fine.gain
+
+        if more >= _BOGIE and gain(every) - gain(places) > 2 * cost * more:
+            return True
+        return fewer >= _BOGIE and gain(places) - gain(places[listed]) < cost * fewer
 
 
 def describe(

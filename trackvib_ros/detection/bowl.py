@@ -85,6 +85,7 @@ def corner(
     guess: float,
     band: tuple[float, float] | None = None,
     refits: int = 2,
+    span: tuple[float, float] | None = None,
 ) -> Corner | None:
     """The corner by maximum likelihood, every wheelset with a load of its own.
 
@@ -94,12 +95,15 @@ def corner(
         guess: of the corner (rad/s).
         band: frequencies compared (Hz); those of the guess by default.
         refits: how often the times are improved.
+        span: of the waveform that is explained, but for margins (s); that of the wheelsets by
+            default.
 
     Returns:
         ``None`` if the waveform does not hold the wheelsets.
     """
     pad = _TAPER * WAVENUMBER / guess if band is None else _PAD_S
-    start, stop = times[0] - pad, times[-1] + pad
+    begin, end = span or (float(times[0]), float(times[-1]))
+    start, stop = begin - pad, end + pad
     first, last = np.searchsorted(wave.time, [start, stop])
     time, valid = wave.time[first:last], wave.valid[first:last]
     if valid.sum() < 16:

@@ -164,7 +164,7 @@ def _described(
     if not passage.known:
         return replace(passage, blind=blind)
     best = passage.hypotheses[0]
-    if blind is None or not blind.contradicts(best.places, best.fit.motion):
+    if blind is None or not blind.contradicts(best.places, best.fit.motion, shown.wave):
         return passage
     return replace(passage, blind=blind, contradicted=True)
 

@@ -232,9 +232,17 @@ class _Trial:
         return 2 * self.bogies.clear + (self.found.certainty > 0.5), self.gain
 
 
+def compared(
+    wave: Wave, times: Array, speed: float, span: tuple[float, float] | None = None
+) -> Corner | None:
+    """What wheelsets (s), each with a load of its own, explain of the deflection at about a speed
+    (m/s), in a band that is the same for all: of one span (s), their gains can be compared."""
+    return corner(wave, times, WAVENUMBER * speed, _AMONG, refits=0, span=span)
+
+
 def _weighed(shown: Shown, speed: float, found: Wheelsets, times: Array, unknowns: int) -> _Trial:
     """A trial with what its wheelsets, of so many unknowns each, explain of the deflection."""
-    fine = corner(shown.wave, times, WAVENUMBER * speed, _AMONG, refits=0)
+    fine = compared(shown.wave, times, speed)
     gain = -np.inf if fine is None else fine.worth(unknowns)
     return _Trial(speed, found, times, fine, gain, bogies(times))
 
