@@ -7,6 +7,7 @@ from tests.detection.synthetic import CATALOGUE, RAILS, Passage, record
 from trackvib_ros.detection.delay import find_delay, log_ratio
 from trackvib_ros.detection.features import GroupStream
 from trackvib_ros.detection.record import Record
+from trackvib_ros.detection.travel import PLACE_SIGMA
 from trackvib_ros.waveform import Waveform
 
 RATE = 2000
@@ -27,10 +28,10 @@ def records(samples, floor):
     return out
 
 
-def train(seed, kind, snr, seen):
+def train(seed, kind, snr, seen, name=None):
     """A train of which ``seen`` metres have passed both channels."""
     rng = np.random.default_rng(seed)
-    name = ("CRH3", "articulated", "metro", "locomotive_hauled")[seed % 4]
+    name = name or ("CRH3", "articulated", "metro", "locomotive_hauled")[seed % 4]
     direction = 1 if seed % 2 else -1
     truth = Passage(CATALOGUE[name].axles, rng.uniform(60, 360) / 3.6, direction=direction)
     signals = record([truth], RAILS, snr, seed=seed, rates={"rail": RATE}, kind=kind)
@@ -58,12 +59,25 @@ def test_the_delay_tells_speed_and_direction_within_its_sigma(kind, seen):
     told = [train(seed, kind, 10, seen) for seed in range(12)]
     found = [(truth, delay) for truth, delay in told if delay is not None]
     assert len(found) >= 5  # others are told at a later trial
-    z = [(delay.speed - truth.speed) / delay.sigma for truth, delay in found]
     assert all(delay.direction == truth.direction for truth, delay in found)
-    # bursts have nothing in common but their places; of five or more the rms is below 1.8 at 99 %
-    assert np.sqrt(np.mean(np.square(z))) < 1.8
+    # computed pulses stand exactly where they should
+    exact = [np.sqrt(delay.sigma**2 - (PLACE_SIGMA / 20 * delay.speed) ** 2) for _, delay in found]
+    z = [(found[i][1].speed - found[i][0].speed) / exact[i] for i in range(len(found))]
+    rms = np.sqrt(np.mean(np.square(z)))
+    # of five or more the rms lies between 0.33 and 1.74 at 98 % (chi squared)
+    assert rms < 1.74
+    # bursts have nothing in common but their places, which are drawn exactly as well
+    assert rms > 0.33 or kind == "burst"
     relative = np.median([delay.sigma / delay.speed for _, delay in found])
     assert relative < (0.004 if kind == "pulse" else 0.015)  # 2 cm; 25 cm of 20 m
+
+
+def test_cars_as_long_as_the_channels_are_apart_are_not_taken_for_each_other():
+    # a metro's 19.5 m on 20 m: the next car reaches both channels as if at once
+    for seed in range(6):
+        truth, delay = train(seed, "pulse", 10, 45.0, "metro")
+        assert delay is not None and delay.direction == truth.direction
+        assert delay.speed == pytest.approx(truth.speed, rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["noise", "blow", "hum"])

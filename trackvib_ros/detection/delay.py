@@ -9,7 +9,11 @@ the sample correlation r the likelihood ratio of a true correlation ρ to none i
 (Jeffreys, Theory of Probability, 1961, sec. 5.9), here averaged over 0 < ρ < 1 and over the bands:
 a signal that shows nothing weighs next to nothing, and a peak by chance no more than it is worth.
 n is that of what the channels do not share at the delay, which is white only if the delay is right.
-The prior of the speed is uniform in its logarithm. Constant speed.
+
+A train repeats itself after every car, so that a wrong delay may look as good as the right one
+under the filters of its own speed, which pass other data. All likely delays, and what reaches both
+channels at once, are therefore compared under the filters of each of them, and by which channel
+became strong first. The prior of the speed is uniform in its logarithm. Constant speed.
 """
 
 from __future__ import annotations
@@ -20,10 +24,12 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
+from scipy.interpolate import CubicSpline
 
 from .pattern import Trace
 from .record import Record
+from .strength import strong_interval
 from .travel import (
     BROAD,
     CELL,
@@ -44,12 +50,20 @@ _ENERGY_FINE, _ENERGY_BROAD = 0.4, 6.0  # m, between which bogies and wheelsets 
 _RATIO = 1.25  # of successive speeds, whose filters serve the delays between
 _FINER = 2  # delays per cell
 _STEP = CELL / _FINER
-_RHO = (np.arange(20) + 0.5) / 20
-_MOST = 0.99  # correlation, above which no more is claimed
+_ATANH = (np.arange(24) + 0.5) * 0.2
+_RHO = np.tanh(_ATANH)
+_RHO_PRIOR = np.log((1 - _RHO**2) * _ATANH.size * 0.2)  # uniform in the correlation
+_MOST = 0.9999  # correlation, above which no more is claimed
 _LEAST_OVERLAP = 6.0  # m that both channels must have seen: the wheelsets of a bogie and quiet
 _CANDIDATES = 5  # delays that are weighed by what is left of the signals
+_LOOKS = 40  # delays either side of one, at most, at which it is compared with others
+_PARTS = 8  # of the step between delays, for the posterior
 _NEAR = 1.0  # m about a delay: beyond, another wheelset is taken for this one
 _EVIDENCE = 1e4  # likelihood ratio to chance at which a delay is told
+_TRAVELS = 19.0  # the same to what comes at once: 95 %
+_FIRST_SIGMA = 2.5  # m, where a channel becomes strong: at the first wheelset or the next one
+_LATE = 0.1  # probability that one does so at some later time
+_KNOWN_START = 0.1  # s after the start of the record: what is strong before may have been so
 
 
 @dataclass(frozen=True)
@@ -75,7 +89,7 @@ def log_ratio(r: Array, n: Array) -> Array:
     n = np.maximum(np.asarray(n)[..., None], 2.0)
     log = 0.5 * (n - 1) * np.log(1 - _RHO**2)
     log = log - (n - 1.5) * np.log(1 - _RHO * np.asarray(r)[..., None])
-    return _log_mean(log)
+    return _log_mean(log + _RHO_PRIOR)
 
 
 def _log_mean(log: Array) -> Array:
@@ -84,80 +98,40 @@ def _log_mean(log: Array) -> Array:
     return np.asarray(top + np.log(np.mean(np.exp(log - top[..., None]), axis=-1)))
 
 
-class _Signals:
-    """The same quantity of two channels in cells of distance at one trial speed.
-
-    Args:
-        pair: series of both, shape (cells,).
-        lags: of the second behind the first, in parts of a cell.
-        place: standard deviation of where a wheel shows itself (m), beyond what noise makes.
-    """
-
-    def __init__(self, pair: Sequence[Array], lags: NDArray[np.int64], place: float) -> None:
-        self.pair = a, b = tuple(limited(x - x.mean()) for x in pair)
-        self.place = place
-        n = a.size
-        size = int(fft.next_fast_len(2 * n, real=True))
-        cross = np.conj(fft.rfft(a, size)) * fft.rfft(b, size)
-        product = _FINER * fft.irfft(cross, _FINER * size)[lags % (_FINER * size)]
-        whole = np.clip(np.round(lags / _FINER).astype(np.int64), -n, n)
-        begin, end = np.maximum(-whole, 0), np.minimum(n - whole, n)  # cells of the first
-        end = np.maximum(end, begin)
-        one, other = (np.concatenate([[0.0], np.cumsum(x * x)]) for x in (a, b))
-        power = (one[end] - one[begin]) * (other[end + whole] - other[begin + whole])
-        self.r = np.clip(product / np.sqrt(np.maximum(power, 1e-300)), -_MOST, _MOST)
-        self.overlap = (end - begin).astype(np.float64)
-        # N / sum of the products of the autocorrelations (Bartlett), by Parseval's theorem
-        products = (
-            2 * float(np.abs(cross) @ np.abs(cross)) / size / max(one[-1] * other[-1], 1e-300)
-        )
-        share = 1 / max(products, 1.0)
-        self.gain = -0.5 * share * self.overlap * np.log(1 - np.maximum(self.r, 0.0) ** 2)
-
-    def log(self, lag: int, near: slice) -> Array:
-        """ln of the likelihood ratio of the delays ``near`` a lag to nothing in common."""
-        a, b = self.pair
-        whole = round(lag / _FINER)
-        begin, end = max(-whole, 0), min(a.size - whole, a.size)
-        left = residual(a[begin:end], b[begin + whole : end + whole])
-        share = independent(left) / left.size
-        log = log_ratio(self.r[near], share * self.overlap[near])
-        return _blurred(log, self.place) if self.place else log
-
-
-def _blurred(log: Array, sigma: float) -> Array:
-    """ln of the mean likelihood over a Gaussian of this width (m)."""
-    reach = int(np.ceil(3 * sigma / _STEP))
-    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) * _STEP / sigma) ** 2)
-    top = log.max()
-    padded = np.pad(np.exp(log - top), reach, mode="edge")
-    return np.asarray(top + np.log(np.convolve(padded, weight / weight.sum(), mode="valid")))
+def _blurred(log: Array, reach: int) -> Array:
+    """ln of the mean likelihood over a Gaussian, three standard deviations of it ``reach``."""
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) * 3 / reach) ** 2)
+    return np.asarray(ndimage.convolve1d(log, weight / weight.sum(), axis=-1, mode="nearest"))
 
 
 @dataclass(frozen=True)
-class _Peak:
-    """The delays near one that is likely.
+class _Near:
+    """Delays about one, as a trial sees them.
 
     Attributes:
-        speed: of every delay, its sign the direction (m/s).
-        log: of the likelihood ratio to nothing in common.
-        prior: ln of the prior probability, but for a constant.
-        band: whose energies agree best.
+        lags: in parts of a cell, shape (lags,).
+        prior: ln of the prior probability of every delay, but for a constant, shape (lags,).
+        blur: three standard deviations of where a wheel shows itself in energies, steps of lags.
     """
 
-    speed: Array
-    log: Array
+    lags: NDArray[np.int64]
     prior: Array
-    band: int
-
-    @property
-    def weight(self) -> float:
-        """ln of the whole."""
-        return float(np.logaddexp.reduce(self.log + self.prior))
+    blur: int
 
 
 class _Trial:
-    """All delays at speeds of a ``span`` (m/s) under the filters of their mean."""
+    """Waveforms and energies of two channels under the filters of a speed: the mean of a ``span``.
+
+    Signals are the waveform, then the log-energies of the bands, in cells of distance at that
+    speed.
+
+    Args:
+        waves: of both channels.
+        traces: of both channels, one per band.
+        within: from and to (s).
+        baseline: distance of the channels (m).
+        span: of speeds whose delays the filters serve (m/s).
+    """
 
     def __init__(
         self,
@@ -175,37 +149,180 @@ class _Trial:
             return
         steps = np.arange(count + 1, dtype=np.float64) - count
         edges = within[1] + steps * (CELL / self.centre)
-        self.reach = round(_NEAR / _STEP)
-        most = int(baseline * self.centre / span[0] / _STEP) + self.reach + 1
-        self.lags = np.arange(-most, most + 1)
-        levels = [
-            [band_pass(t.levels(edges), _ENERGY_FINE, _ENERGY_BROAD) for t in pair]
-            for pair in zip(*traces, strict=True)
-        ]
-        self.wave = _Signals(
-            [band_pass(w.cells(edges), _FINE, BROAD) for w in waves], self.lags, 0.0
+        wave = np.stack([w.cells(edges) for w in waves])[:, None]
+        energy = np.stack([[t.levels(edges) for t in own] for own in traces])
+        both = np.concatenate(
+            [band_pass(wave, _FINE, BROAD), band_pass(energy, _ENERGY_FINE, _ENERGY_BROAD)], axis=1
         )
-        self.energies = [_Signals(pair, self.lags, ENERGY_PLACE_SIGMA) for pair in levels]
-        self.gain = self.wave.gain + np.max([e.gain for e in self.energies], axis=0)
+        # (channels, signals, cells)
+        self._pair = limited(both - both.mean(axis=-1, keepdims=True))
+        size = int(fft.next_fast_len(2 * count, real=True))
+        spectra = fft.rfft(self._pair, size)
+        cross = np.conj(spectra[0]) * spectra[1]
+        self._product = _FINER * fft.irfft(cross, _FINER * size)
+        self._power = np.zeros((*self._pair.shape[:2], count + 2))
+        np.cumsum(self._pair**2, axis=-1, out=self._power[..., 1:-1])
+        self._power[..., -1] = self._power[..., -2]
+        # N / sum of the products of the autocorrelations (Bartlett), by Parseval's theorem
+        whole = np.maximum(np.prod(self._power[..., -1], axis=0), 1e-300)
+        self._share = 1 / np.maximum(2 * np.sum(np.abs(cross) ** 2, axis=-1) / size / whole, 1.0)
+        most = int(baseline * self.centre / span[0] / _STEP) + 1
+        self._lags = np.arange(-most, most + 1)
+        gain = self._gain_of(*self.compare(self._lags))
+        self._gain = gain[0] + gain[1:].max(axis=0)
 
-    def best(self, low: float, high: float) -> int:
-        """Index of the best delay between two (m); the gain is in :attr:`gain`."""
-        way = self.lags * _STEP
-        return int(np.argmax(np.where((way >= low) & (way <= high), self.gain, -1.0)))
+    def compare(self, lags: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Correlations, shape (signals, lags), and overlap (cells), at lags of the second."""
+        n = self._pair.shape[-1]
+        cells = np.clip(lags / _FINER, -n, n)
+        begin, end = np.maximum(-cells, 0), np.minimum(n - cells, n)  # of the first
+        first = self._energy(0, end) - self._energy(0, begin)
+        second = self._energy(1, end + cells) - self._energy(1, begin + cells)
+        product = self._product[:, lags % self._product.shape[-1]] * (np.abs(cells) < n)
+        r = product / np.sqrt(np.maximum(first * second, 1e-300))
+        return np.clip(r, -_MOST, _MOST), end - begin
 
-    def bests(self) -> list[int]:
-        """The best delay of either direction."""
-        low, high = (self.baseline * self.centre / v for v in reversed(self.span))
+    def _energy(self, channel: int, to: Array) -> Array:
+        """Sum of the squares up to a place between cells, shape (signals, places)."""
+        whole = to.astype(np.intp)
+        power = self._power[channel]
+        return np.asarray(power[:, whole] + (to - whole) * (power[:, whole + 1] - power[:, whole]))
+
+    def _gain_of(self, r: Array, overlap: Array) -> Array:
+        """ln of the likelihood ratio of a correlation to none, by the signals themselves."""
+        square = np.maximum(r, 0.0) ** 2
+        return np.asarray(-0.5 * self._share[:, None] * overlap * np.log(1 - square))
+
+    def best(self, low: float, high: float) -> tuple[float, float]:
+        """The largest gain of the delays between two (s), and its delay (s)."""
+        delay = self._lags * (_STEP / self.centre)
+        k = int(np.argmax(np.where((delay >= low) & (delay <= high), self._gain, -1.0)))
+        return float(self._gain[k]), float(delay[k])
+
+    def bests(self) -> list[tuple[float, float]]:
+        """The same of either direction."""
+        low, high = (self.baseline / v for v in reversed(self.span))
         return [self.best(low, high), self.best(-high, -low)]
 
-    def peak(self, k: int) -> _Peak:
-        """A delay, by its index, and its neighbours."""
-        lag, near = int(self.lags[k]), slice(max(k - self.reach, 0), k + self.reach + 1)
-        rows = np.stack([e.log(lag, near) for e in self.energies])
-        log = self.wave.log(lag, near) + _log_mean(rows.T)
-        way = np.maximum(np.abs(self.lags[near]) * _STEP, CELL)
-        speed = np.sign(lag) * self.baseline * self.centre / way
-        return _Peak(speed, log, np.log(_STEP / way), int(np.argmax(rows.max(axis=1))))
+    def near(self, delay: float, speed: float) -> _Near:
+        """The delays about one (s) that a train of a speed (m/s) makes."""
+        scale = self.centre / _STEP  # parts of a cell in a second
+        reach = max(round(_NEAR / speed * scale), 1)
+        step = 1 + reach // _LOOKS
+        lags = round(delay * scale) + step * np.arange(-(reach // step), reach // step + 1)
+        blur = max(round(3 * ENERGY_PLACE_SIGMA / speed * scale / step), 1)
+        return _Near(lags, np.log(step / np.maximum(np.abs(lags), 1)), blur)
+
+    def _cut(self, lag: int) -> Array:
+        """What both channels have seen at a lag, shape (channels, signals, cells)."""
+        n, whole = self._pair.shape[-1], round(lag / _FINER)
+        begin, end = max(-whole, 0), min(n - whole, n)
+        return np.stack(
+            [self._pair[0, :, begin:end], self._pair[1, :, begin + whole : end + whole]]
+        )
+
+    def logs(self, delays: Sequence[_Near]) -> tuple[list[Array], Array]:
+        """ln of the likelihood ratio of every delay to nothing in common.
+
+        What the channels do not share is noise; how many samples of it are independent, the best
+        of the delays tells, for all explain the same samples.
+
+        Returns:
+            One array for each of ``delays``; independent samples a cell, shape (signals,).
+        """
+        lags = np.concatenate([near.lags for near in delays])
+        cuts = np.cumsum([near.lags.size for near in delays])[:-1]
+        r, overlap = self.compare(lags)
+        share = np.empty(len(r))
+        for row, k in enumerate(np.argmax(self._gain_of(r, overlap), axis=1)):
+            left = residual(*self._cut(int(lags[k]))[:, row])
+            share[row] = independent(left) / left.size
+        rows = log_ratio(r, share[:, None] * overlap)
+        out = []
+        for part, near in zip(np.split(rows, cuts, axis=1), delays, strict=True):
+            out.append(part[0] + _over_bands(part[1:], near.blur))
+        return out, share
+
+    def band(self, delay: float) -> int:
+        """The band whose energies agree best at a delay (s)."""
+        r, _ = self.compare(np.array([round(delay * self.centre / _STEP)]))
+        return int(np.argmax(r[1:, 0]))
+
+    def posterior(self, delay: float, speed: float, share: Array) -> tuple[Array, Array]:
+        """Speeds (m/s) about the right delay (s), and their probabilities.
+
+        Args:
+            delay: the right one (s).
+            speed: that it tells (m/s).
+            share: independent samples a cell, shape (signals,).
+        """
+        near = self.near(delay, speed)
+        lags = np.linspace(near.lags[0], near.lags[-1], 1 + _PARTS * (near.lags.size - 1))
+        r, overlap = self.compare(near.lags)
+        pairs = self._pairs(near.lags[np.argmax(r, axis=1)])
+        overlap = np.interp(lags, near.lags, overlap)
+        r = np.clip(CubicSpline(near.lags, r, axis=1)(lags), -_MOST, _MOST)
+        log = log_ratio(r, pairs[:, None] * overlap)
+        # or a signal has nothing in common, and tells nothing
+        common = _log_mean(log_ratio(r, share[:, None] * overlap)) - _log_mean(log)
+        log = np.logaddexp(0.0, log + common[:, None])
+        way = np.maximum(np.abs(lags), 1.0)
+        total = log[0] + _over_bands(log[1:], _PARTS * near.blur) - np.log(way)
+        weight = np.exp(total - total.max())
+        return self.baseline * self.centre / _STEP / way, weight / weight.sum()
+
+    def _pairs(self, lags: NDArray[np.int64]) -> Array:
+        """Independent pairs a cell that make a peak as wide as its place is uncertain.
+
+        The place is where sum(u) = 0, u = (a b' - a' b) / 2, which is zero wherever both are alike;
+        its variance is var(sum(u)) / sum(a' b')², by what the channels differ over every piece of
+        the train, pieces the longest wave of the filter (sandwich estimate; Ribatet, Cooley &
+        Davison, Statistica Sinica 22, 2012, 813; Newey & West, Econometrica 55, 1987, 703).
+
+        Args:
+            lags: of the peaks, one per signal.
+        """
+        out = np.zeros(lags.size)
+        piece = round(BROAD / CELL)
+        for row, lag in enumerate(lags):
+            a, b = self._cut(int(lag))[:, row]
+            if a.size <= 3 * piece:
+                continue
+            slope, other = np.gradient(a), np.gradient(b)
+            bend = float(slope @ other)
+            norm = float(np.sqrt((a @ a) * (b @ b)))
+            r = min(float(a @ b) / max(norm, 1e-300), _MOST)
+            if bend <= 0 or r <= 0:
+                continue
+            u = 0.5 * (a * other - slope * b)
+            u -= float(u.sum()) / bend * slope * other
+            moving = np.convolve(u, np.ones(piece))
+            variance = float(moving @ moving) / piece / bend**2
+            # estimated from so few pieces: that of Student's distribution
+            count = a.size / piece
+            variance *= (count - 1) / (count - 3)
+            out[row] = (1 - r * r) / (r * bend / norm * max(variance, 1e-300)) / a.size
+        return out
+
+
+def _over_bands(log: Array, blur: int) -> Array:
+    """ln of the mean likelihood of energies, a wheel being seen near where it stands."""
+    top = float(log.max())
+    mean = _blurred(np.exp(log - top).mean(axis=0), blur)
+    return np.asarray(top + np.log(np.maximum(mean, 1e-300)))
+
+
+@dataclass(frozen=True)
+class _Likely:
+    """A delay (s) that is likely, the speed it tells (m/s), and the trial that found it."""
+
+    delay: float
+    speed: float
+    trial: _Trial
+
+    def differs(self, other: _Likely) -> bool:
+        """Whether they take different wheelsets for one."""
+        return abs(self.delay - other.delay) > _NEAR / min(self.speed, other.speed)
 
 
 def find_delay(
@@ -234,28 +351,78 @@ def find_delay(
     trials = [trial for trial in tried if trial.enough]
     if not trials:
         return None
-    found = [(float(t.gain[k]), t, k) for t in trials for k in t.bests()]
-    found.sort(key=lambda item: -item[0])
-    peaks = [trial.peak(k) for _, trial, k in found[:_CANDIDATES]]
-    weights = np.array([peak.weight for peak in peaks])
-    best = peaks[int(np.argmax(weights))]
-    evidence = float(np.logaddexp.reduce(weights)) - float(np.log(2 * range_))
-    # what reaches both channels faster than a train
-    at_once = 0.5 * baseline / limits[1]
-    still = [(t, t.best(-at_once * t.centre, at_once * t.centre)) for t in trials]
-    trial, k = max(still, key=lambda item: float(item[0].gain[item[1]]))
-    nothing = float(np.logaddexp(0.0, trial.peak(k).log.max()))
-    if evidence < nothing + np.log(_EVIDENCE):
+    moving = _likeliest(trials, baseline)
+    likely = [*moving, _at_once(trials, 0.5 * baseline / limits[1], limits[1])]
+    views: dict[float, tuple[list[float], Array]] = {}
+    for trial in {item.trial.centre: item.trial for item in likely}.values():
+        near = [trial.near(item.delay, item.speed) for item in likely]
+        logs, share = trial.logs(near)
+        sums = [float(_log_sum(x + n.prior)) for x, n in zip(logs[:-1], near, strict=False)]
+        views[trial.centre] = [*sums, float(logs[-1].max())], share
+    told = np.array([weight for weight, _ in views.values()])
+    # the filters pass data in common: together they tell what they tell on average
+    weights = told.mean(axis=0) + _order(likely, (first, second), traces, within)
+    k = int(np.argmax(weights[:-1]))
+    # the mean of likelihood ratios to chance is one, however they depend on each other
+    chance = float(np.log(2 * range_))
+    evidence = float(_log_mean(told[:, k])) - chance
+    travels = float(weights[k] - weights[-1]) - chance
+    if evidence < np.log(_EVIDENCE) or travels < np.log(_TRAVELS):
         return None
-    rough = float(best.speed[np.argmax(best.log)])
-    speeds = np.concatenate([peak.speed for peak in peaks])
-    log = np.concatenate([peak.log + peak.prior for peak in peaks])
-    density = np.exp(log - log.max())
-    near = np.abs(speeds / rough - 1) < _NEAR / baseline
-    sure = float(density[near].sum() / density.sum()) / (1 + np.exp(min(nothing - evidence, 50.0)))
-    weight = np.exp(best.log + best.prior - best.weight)
-    speed = float(weight @ np.abs(best.speed))
-    variance = float(weight @ (np.abs(best.speed) - speed) ** 2)
-    variance += float(density[~near] @ (speeds[~near] - rough) ** 2 / density.sum())
-    sigma = float(np.hypot(variance**0.5, PLACE_SIGMA * speed / baseline))
-    return Delay(speed, sigma, 1 if rough > 0 else -1, sure, best.band)
+    best, direction = moving[k], 1 if moving[k].delay > 0 else -1
+    _, share = views[best.trial.centre]
+    speeds, weight = best.trial.posterior(best.delay, best.speed, share)
+    speed = float(weight @ speeds)
+    among = np.exp(weights[:-1] - _log_sum(weights[:-1]))
+    errors = np.array([direction * np.sign(item.delay) * item.speed - speed for item in moving])
+    errors[k] = float(np.sqrt(weight @ (speeds - speed) ** 2))
+    sigma = float(np.hypot(np.sqrt(among @ errors**2), PLACE_SIGMA * speed / baseline))
+    sure = float(among[k]) / (1 + np.exp(-travels))
+    return Delay(speed, sigma, direction, sure, best.trial.band(best.delay))
+
+
+def _log_sum(log: Array) -> Array:
+    return np.asarray(np.logaddexp.reduce(log))
+
+
+def _likeliest(trials: Sequence[_Trial], baseline: float) -> list[_Likely]:
+    """The best delays that a train can make and that differ."""
+    found = [(gain, delay, trial) for trial in trials for gain, delay in trial.bests()]
+    out: list[_Likely] = []
+    for _, delay, trial in sorted(found, key=lambda item: -item[0]):
+        one = _Likely(delay, baseline / max(abs(delay), 1e-9), trial)
+        if all(one.differs(other) for other in out):
+            out.append(one)
+    return out[:_CANDIDATES]
+
+
+def _at_once(trials: Sequence[_Trial], most: float, speed: float) -> _Likely:
+    """What reaches both channels faster than a train: the best delay not above one (s)."""
+    found = [(*trial.best(-most, most), trial) for trial in trials]
+    _, delay, trial = max(found, key=lambda item: item[0])
+    return _Likely(delay, speed, trial)
+
+
+def _order(
+    likely: Sequence[_Likely],
+    records: Sequence[Record],
+    traces: Sequence[Sequence[Trace]],
+    within: tuple[float, float],
+) -> Array:
+    """ln of the likelihood of the delays by when the channels become strong, shape (delays,)."""
+    delays = np.array([item.delay for item in likely])
+    sigma = _FIRST_SIGMA / np.array([item.speed for item in likely])
+    late = _LATE / (2 * (within[1] - within[0]))
+    told = []
+    for band, pair in enumerate(zip(*traces, strict=True)):
+        starts = []
+        for record, trace in zip(records, pair, strict=True):
+            low, high = record.window.bands[band]
+            found = strong_interval(trace, high - low, within)
+            if found is not None and found[0] > within[0] + _KNOWN_START:
+                starts.append(found[0])
+        if len(starts) == 2:
+            z = (starts[1] - starts[0] - delays) / sigma
+            density = np.exp(-0.5 * z**2) / (np.sqrt(2 * np.pi) * sigma)
+            told.append(np.log((1 - _LATE) * density + late))
+    return np.asarray(np.mean(told, axis=0)) if told else np.zeros(len(likely))

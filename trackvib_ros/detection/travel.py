@@ -126,18 +126,20 @@ class Pair:
 
 
 def band_pass(x: Array, fine: float, broad: float) -> Array:
-    """Difference of two Gaussian averages of these widths (m); spacing :data:`CELL`."""
-    size = int(fft.next_fast_len(x.size + int(4 * broad / CELL), real=True))
+    """Difference of two Gaussian averages of these widths (m), last axis; spacing :data:`CELL`."""
+    count = x.shape[-1]
+    size = int(fft.next_fast_len(count + int(4 * broad / CELL), real=True))
     k = 2 * np.pi * np.arange(size // 2 + 1) / (size * CELL)
     weight = np.exp(-0.5 * (k * fine) ** 2) - np.exp(-0.5 * (k * broad) ** 2)
-    padded = np.pad(x, (0, size - x.size), mode="edge" if x.size else "constant")
-    out = fft.irfft(fft.rfft(padded) * weight, size)[: x.size]
+    padding = [(0, 0)] * (x.ndim - 1) + [(0, size - count)]
+    padded = np.pad(x, padding, mode="edge" if count else "constant")
+    out = fft.irfft(fft.rfft(padded) * weight, size)[..., :count]
     return out.astype(np.float64)
 
 
 def limited(x: Array) -> Array:
-    """A series cut at :data:`_CLIP` of its rms."""
-    limit = _CLIP * float(np.sqrt(np.mean(x * x)))
+    """Series cut at :data:`_CLIP` of their rms over the last axis."""
+    limit = _CLIP * np.sqrt(np.mean(x * x, axis=-1, keepdims=True))
     return np.clip(x, -limit, limit)
 
 
