@@ -545,9 +545,11 @@ def catalogue(but: str = "") -> Catalogue:
 
 def judge(s: StandIn, known: Catalogue | None = None) -> dict[str, Any]:
     """What the detector makes of a stand-in, against the truth."""
-    events = detect(s.rate, s.samples, s.channels, known or catalogue())
+    clock = s.rate if s.clock is None else s.clock
+    zero = 0.0 if s.clock is None else float(s.clock[0])
+    events = detect(clock, s.samples, s.stated or s.channels, known or catalogue())
     told = [e for e in events if e.kind == "passage" and e.values["grade"] == CONFIRMED]
-    arrivals = [e.stamp_ns * 1e-9 for e in events if e.kind == "arrival"]
+    arrivals = [e.stamp_ns * 1e-9 - zero for e in events if e.kind == "arrival"]
     first = min(float(s.axle_times(c.x)[0]) for c in s.channels)
     result: dict[str, Any] = {
         "train": s.train,
@@ -561,7 +563,7 @@ def judge(s: StandIn, known: Catalogue | None = None) -> dict[str, Any]:
         return result
     event = told[0]
     v = event.values
-    x = v["reference_x"].value
+    x = next(c.x for c in s.channels if c.name == v["reference"])
     times = s.axle_times(x)
     speed = v["speed"]
     result |= {
@@ -573,11 +575,11 @@ def judge(s: StandIn, known: Catalogue | None = None) -> dict[str, Any]:
         "direction": {"forward": 1, "backward": -1, "unknown": 0}[v["direction"]] * s.direction,
     }
     if "departure_ns" in v:
-        result["departure"] = v["departure_ns"] * 1e-9 - times[-1]
+        result["departure"] = v["departure_ns"] * 1e-9 - zero - times[-1]
     if "axle_count" in v:
         result |= {
             "count": v["axle_count"] - times.size,
-            "arrival": v["arrival_ns"] * 1e-9 - times[0],
+            "arrival": v["arrival_ns"] * 1e-9 - zero - times[0],
         }
     return result
 

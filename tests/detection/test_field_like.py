@@ -54,6 +54,31 @@ def test_a_record_of_exactly_one_passage(train, shape, rails):
     assert "truncated_start" not in passage.quality
 
 
+def test_loggers_whose_clocks_differ_tell_the_type_and_its_speed():
+    s = stand_in(SEEDS["figures"] + 41, "none", "roomy", 1000.0, 2, snr_db=25, train="ICE3")
+    s.samples[:, 1] = np.roll(s.samples[:, 1], 170)
+    events = detect(s.rate, s.samples, s.channels, KNOWN)
+    (passage,) = of(events, "passage")
+    assert passage.values["type"] == "ICE3"
+    assert passage.values["direction"] == "unknown"  # the delay may be the clock's
+    speed = passage.values["speed"]
+    assert abs(speed.value - s.mid_speed(0.0)) < 3 * speed.sigma < 0.03 * speed.value
+    (health,) = [e for e in of(events, "health") if e.quality == ("unsynchronised",)]
+    offset = health.values["clock_offset"]
+    assert abs(offset.value - 0.17) < 3 * offset.sigma
+
+
+def test_a_sensor_that_is_elsewhere_does_not_tell_the_speed():
+    s = stand_in(SEEDS["figures"] + 41, "none", "roomy", 1000.0, 2, snr_db=25, train="ICE3")
+    stated = (s.channels[0], Channel("b", s.channels[1].x + 2.0, "rail"))
+    events = detect(s.rate, s.samples, stated, KNOWN)
+    (passage,) = of(events, "passage")
+    assert passage.values["type"] == "ICE3"
+    speed = passage.values["speed"]
+    assert abs(speed.value - s.mid_speed(0.0)) < 3 * speed.sigma < 0.03 * speed.value
+    assert {"moved", "unsynchronised"} & set(passage.quality)
+
+
 def test_a_tight_record_in_blocks_of_any_size():
     s = stand_in(SEEDS["figures"] + 3, shape="tight", rate=1000.0, train="class_425", snr_db=25)
     data = (s.samples / np.abs(s.samples).max()).astype(np.float32)

@@ -208,6 +208,7 @@ class Closing:
             return events
         used = {trace.name for trace in trains[0].traces}
         offsets = {name: (o, sigma) for name, o, sigma in trains[0].clock_offset}
+        moved = {name: (o, sigma) for name, o, sigma in trains[0].moved}
         tell = self.health.tell
         for record in records:
             name = record.channel.name
@@ -224,6 +225,10 @@ class Closing:
             if name in offsets:
                 values["clock_offset"] = Estimate(*offsets[name], "s")
             events += tell(now_ns, name, "unsynchronised", name in offsets, values)
+            place: dict[str, Value] = {}
+            if name in moved:
+                place["position_offset"] = Estimate(*moved[name], "m")
+            events += tell(now_ns, name, "moved", name in moved, place)
         return events
 
 

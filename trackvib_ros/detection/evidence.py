@@ -1,5 +1,5 @@
 """Which explanation of the wheelset times is right: a type of the catalogue, a relative of it, a
-wrong clock.
+wrong clock, a misstated place.
 
 Every explanation is a linear model with Gaussian effects: place of wheelset i at channel c,
 
@@ -26,13 +26,19 @@ from .kinematics import PRIOR_ACCELERATION, Motion
 from .place import Wave, agreement
 
 Array = NDArray[np.float64]
-Kind: TypeAlias = Literal["type", "scaled", "varied", "clock"]
+Kind: TypeAlias = Literal["type", "scaled", "varied", "moved", "clock"]
 
 PRIOR_UNKNOWN = 0.05
 """Prior probability that a train is not in the catalogue."""
 
-PRIOR_CLOCK = 1e-4
+PRIOR_CLOCK = 1e-3
 """Prior probability that a channel's clock is off: rarer than an unlisted train by far."""
+
+PRIOR_MOVED = 1e-3
+"""Prior probability that a channel is not where it is said to be, beyond what a tape explains."""
+
+LISTED: tuple[Kind, ...] = ("type", "moved", "clock")
+"""Explanations by a type of the catalogue."""
 
 # m, at every channel wheelsets with other neighbours have other pulses: on computed passages at 20
 # and 40 dB rms 0.012 m, one in twenty beyond 0.03 m; more where noise hides a pulse
@@ -45,7 +51,8 @@ _SCALE_VARIED = 0.08
 _SHAPE = 0.06  # m, how well the gaps of such relatives agree after scaling
 _GAP_NEAR, _GAP_FAR = 0.2, 0.6  # m, spread of wheelbases and of the other gaps between types
 _NEAR = 3.5  # m
-_CLOCK_S = 0.1
+_CLOCK_S = (0.01, 0.1, 1.0)  # a wrong clock is off by ms or by s, every decade as likely
+_MOVED_M = (0.1, 1.0)  # the same of a misstated place
 _OUTLIER = 2.5
 _SAME_PULSE = 1.25  # m, half a wheelbase
 _LEAST_COMMON = 0.75  # share of the places, so that what is left out can be accidents
@@ -85,7 +92,8 @@ class Explanation:
     Attributes:
         candidate: index of the type it starts from.
         kind: ``type`` as in the catalogue; ``scaled`` a relative of the same shape; ``varied`` one
-            with other gaps; ``clock`` the type, and the clock of ``channel`` is off.
+            with other gaps; ``clock`` the type, and the clock of ``channel`` is off; ``moved`` the
+            type, and ``channel`` is not where it is said to be.
         probability: posterior.
         motion: under this model, with covariance.
         phase: log likelihood of the low-passed waveforms under it against noise.
@@ -233,6 +241,12 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
     return agreement(candidate.waves, motion, ahead).log
 
 
+def clock_density(offset: float) -> float:
+    """Prior density (1/s) of the offset of a clock that is off (s)."""
+    w = np.array(_CLOCK_S)
+    return float(np.mean(np.exp(-0.5 * (offset / w) ** 2) / w)) / float(np.sqrt(2 * np.pi))
+
+
 def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     """Every explanation with its posterior probability, most probable first."""
     if not candidates:
@@ -291,20 +305,33 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             ("scaled", -1, coarse if channels > 1 else unlisted, scaled),
             ("varied", -1, coarse, varied),
         ]
+        pace = abs(c.fit.motion.speed)
         for k in range(1, channels):
-            effect = np.zeros((channels, axles))
-            effect[k] = _CLOCK_S * abs(c.fit.motion.speed)
-            trials.append(("clock", k, float(np.log(PRIOR_CLOCK)), [effect]))
-        phase: float | None = None
+            row = np.zeros((channels, axles))
+            row[k] = 1.0
+            clock = float(np.log(PRIOR_CLOCK / len(_CLOCK_S)))
+            trials += [("clock", k, clock, [width * pace * row]) for width in _CLOCK_S]
+            moved = float(np.log(PRIOR_MOVED / len(_MOVED_M)))
+            trials += [("moved", k, moved, [width * row]) for width in _MOVED_M]
+        weighed: list[tuple[float, Kind, int, Motion]] = []
         for kind, channel, log_prior, more in trials:
             log, motion = _model(c, noise, speed, [*base, *more], use)
-            if motion.speed <= 0:
-                continue
-            # a wrong clock moves a channel as a whole, which the pulse takes up; what relatives
-            # have for places is not good enough to be asked for their phase
-            if phase is None:
-                phase = _in_phase(c, motion, c.places, speed)
-            found.append((log + prior + log_prior, phase, index, kind, channel, motion))
+            if motion.speed > 0:
+                weighed.append((log + prior + log_prior, kind, channel, motion))
+        if not weighed:
+            continue
+        # what relatives have for places is not good enough to be asked for their phase; it is that
+        # of the type, before sensors as they are said to be or as they would have to be
+        wrong = [w for w in weighed if w[1] in ("clock", "moved")]
+        phase = _in_phase(c, weighed[0][3], c.places, speed)
+        other = phase
+        if wrong and (best := max(wrong, key=lambda w: w[0]))[0] > weighed[0][0]:
+            other = _in_phase(c, best[3], c.places, speed)
+        shown = {"type": phase, "clock": other, "moved": other}
+        found += [
+            (log, shown.get(kind, max(phase, other)), index, kind, k, motion)
+            for log, kind, k, motion in weighed
+        ]
     if not found:
         return []
     # wheelsets that only rattle have no pulse below 100 Hz: then noise explains the waveforms

@@ -44,8 +44,8 @@ class HealthBook:
     """States of all channels; every change is an event.
 
     States: ``dead`` (the value stands still), ``dropped_out`` (most samples missing), ``drifting``
-    (the mean leaves its place), and from passages ``clipped``, ``unsynchronised``, ``swapped`` and
-    ``insensitive`` (a train passed unnoticed).
+    (the mean leaves its place), and from passages ``clipped``, ``unsynchronised``, ``moved`` (not
+    where it is said to be), ``swapped`` and ``insensitive`` (a train passed unnoticed).
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:

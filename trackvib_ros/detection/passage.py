@@ -87,6 +87,7 @@ class Passage:
         direction: +1, -1, or 0 if unknown.
         explanations: types, relatives of them and wrong clocks, most probable first.
         clock_offset: (channel, offset s, sigma s) for channels whose clock contradicts the motion.
+        moved: (channel, offset m, sigma m) for channels that are not where they are said to be.
         delay: speed by the delays between two channels (m/s), sigma; or None.
         measured: where the channels are, if the pattern alone tells the type.
         baseline: learned correction of the distance between the outer two channels that was
@@ -102,6 +103,7 @@ class Passage:
     direction: int
     explanations: tuple[Explanation, ...] = ()
     clock_offset: tuple[tuple[str, float, float], ...] = ()
+    moved: tuple[tuple[str, float, float], ...] = ()
     delay: tuple[float, float] | None = None
     measured: Measured | None = None
     baseline: tuple[float, float, int] | None = None
@@ -142,13 +144,13 @@ class Passage:
 
     @property
     def _covered(self) -> bool:
-        """Whether, on one channel, no end of the pattern lies where the rail is quiet."""
-        if not self.alone:
+        """Whether no end of the pattern lies where the rails are quiet."""
+        contrast = self.hypotheses[0].fit.contrast.mean(axis=0)
+        middle = float(np.median(contrast))
+        if not self.alone and middle < SEEN:
             return True
-        contrast = self.hypotheses[0].fit.contrast[0]
         ends = contrast[:LEAST_SEEN], contrast[-LEAST_SEEN:]
-        least = _ENDS * float(np.median(contrast))
-        return all(float(np.median(end)) > least for end in ends)
+        return all(float(np.median(end)) > _ENDS * middle for end in ends)
 
     def _patterned(self, least: float) -> bool:
         """Whether a type's pattern is seen with this correlation, or clearly without wheelsets."""

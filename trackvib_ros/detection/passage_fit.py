@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .axles import fit_axles, refit
+from .axles import AxleFit, fit_axles, refit
 from .calibration import Calibration, Measured
 from .catalogue import TrainType
-from .evidence import Candidate, Explanation, explain
+from .evidence import LISTED, Candidate, Explanation, Kind, clock_density, explain
 from .kinematics import Motion, robust_scale
 from .passage import Hypothesis, Passage
 from .passage_scan import Scanned, recentred, see
@@ -22,7 +22,7 @@ CERTAIN = 0.99
 """Probability of a type, by its pattern alone, that teaches where the channels are."""
 
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
-_UNSTATED = 0.5  # m, distance between channels of no use
+_UNSTATED = 5.0  # m, distance between channels of no use
 
 
 def fit_hypotheses(
@@ -41,7 +41,7 @@ def fit_hypotheses(
     """
     reference = usable[0]
     seen = see(usable, trains, limits)
-    direction, kept, offsets = seen.direction, seen.kept, seen.offsets
+    direction, kept = seen.direction, seen.kept
     fitted: list[Hypothesis] = []
     aligned: list[list[Array]] = []
     names = tuple(s.trace.name for s, _ in kept)
@@ -70,19 +70,19 @@ def fit_hypotheses(
     waves = tuple(s.wave for s, _ in kept)
     candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance, waves) for h in fitted]
     explanations = explain(candidates)
-    if explanations and explanations[0].kind == "clock":
-        wrong = kept[explanations[0].channel][0]
-        fit, motion = fitted[explanations[0].candidate].fit, explanations[0].motion
-        k = explanations[0].channel
-        late = fit.time[k] - motion.time_at(
-            candidates[explanations[0].candidate].places + shifts[k]
-        )
-        told = (wrong.trace.name, float(np.median(late)), 0.2 / motion.speed)
+    off, moved = _wrong(explanations, "clock"), _wrong(explanations, "moved")
+    if off is not None and (moved is None or off[1] > moved[1]):
+        best, _ = off
+        k = best.channel
+        wrong = kept[k][0]
         rest = [s for s in usable if s.trace is not wrong.trace]
         passage = fit_hypotheses(rest, trains, limits, site)
+        delay = _late(fitted[best.candidate].fit, best, candidates[best.candidate].places)
+        told = _clock_offset(delay, float(stated[k]) / best.motion.speed, passage.direction)
+        told = told[0], float(np.hypot(told[1], 0.2 / best.motion.speed))
         return replace(
             passage,
-            clock_offset=(*passage.clock_offset, told),
+            clock_offset=(*passage.clock_offset, (wrong.trace.name, *told)),
             quality=tuple({*passage.quality, "unsynchronised"}),
         )
     hypotheses = _with_probabilities(fitted, explanations)
@@ -93,18 +93,55 @@ def fit_hypotheses(
         hypotheses=tuple(hypotheses),
         direction=direction,
         explanations=tuple(explanations),
-        clock_offset=tuple(offsets),
-        quality=("unsynchronised",) if offsets else (),
     )
     if hypotheses and direction:
         last = int(np.argmax(np.abs(stated)))
+        measured = _measure(candidates, names, direction * stated, direction)
         passage = replace(
             passage,
-            delay=delay_speed(passage),
-            measured=_measure(candidates, names, direction * stated, direction),
+            delay=delay_speed(passage) if moved is None else None,
+            measured=measured,
             baseline=(float(offset[last]), float(covariance[last, last] ** 0.5), site.passages),
         )
+        if moved is not None and measured is not None:
+            k = moved[0].channel
+            by = float(measured.offset[k]), float(measured.covariance[k, k] ** 0.5)
+            passage = replace(passage, moved=((names[k], *by),), quality=("moved",))
     return passage
+
+
+def _wrong(explanations: Sequence[Explanation], kind: Kind) -> tuple[Explanation, float] | None:
+    """The best explanation by a wrong clock or place, and the probability of all of its kind.
+
+    ``None`` if what is wrong with a channel is less likely than the rest.
+    """
+    wrong = [e for e in explanations if e.kind in ("clock", "moved")]
+    same = [e for e in wrong if e.kind == kind]
+    if not same or sum(e.probability for e in wrong) <= 0.5:
+        return None
+    return same[0], sum(e.probability for e in same)
+
+
+def _late(fit: AxleFit, found: Explanation, places: Array) -> float:
+    """By how much wheelsets pass the channel of an explanation later than the reference (s)."""
+    k = found.channel
+    seen = fit.observed[k] if fit.observed[k].any() else slice(None)
+    return float(np.median((fit.time[k] - found.motion.time_at(places))[seen]))
+
+
+def _clock_offset(delay: float, way: float, direction: int) -> tuple[float, float]:
+    """Offset of a clock (s) with its sigma.
+
+    Args:
+        delay: of a channel behind the reference as recorded (s).
+        way: that of a train in forward direction (s).
+        direction: of the train; 0 if unknown, then the smaller offset is the likelier.
+    """
+    if direction:
+        return delay - direction * way, 0.0
+    ways = sorted((delay - way, delay + way), key=abs)
+    near, far = (clock_density(offset) for offset in ways)
+    return ways[0], float((far / (near + far)) ** 0.5) * 2 * abs(way)
 
 
 def _same_times(
@@ -164,11 +201,11 @@ def _with_probabilities(
     phase: dict[int, float] = {}
     unknown = sum(e.probability for e in explanations if e.kind in ("scaled", "varied")) > 0.5
     for e in explanations:
-        if e.kind == "type":
+        if listed := e.kind in LISTED:
             total[e.candidate] += e.probability
             phase[e.candidate] = e.phase
         related[e.candidate] += e.probability
-        if (e.kind == "type") != unknown:
+        if listed != unknown:
             motion.setdefault(e.candidate, e.motion)
     order = np.argsort(-(related if unknown else total))
     return [

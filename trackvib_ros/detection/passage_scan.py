@@ -123,7 +123,6 @@ class Seen:
     matches: list[Match]
     direction: int
     kept: list[tuple[Scanned, float]]
-    offsets: list[tuple[str, float, float]]
 
 
 def _in_step(
@@ -167,13 +166,13 @@ def _in_step(
     matches = refine(placed, matches, interval)
     speed = matches[0].speed
     kept = [(s, shift / speed) for s, (_, shift) in zip(usable, placed, strict=True)]
-    return Seen(matches, direction, kept, [])
+    return Seen(matches, direction, kept)
 
 
 def _one_by_one(usable: Sequence[Scanned]) -> Seen:
     """The types in the first channel, with what the others show of them."""
     fine = [replace(s, matches=refine([(s.trace, 0.0)], s.matches, s.interval)) for s in usable]
-    direction, kept, offsets = _delays(fine, fine[0].matches[0])
+    direction, kept = _delays(fine, fine[0].matches[0])
     table: dict[tuple[str, bool], float] = {}
     for s, _ in kept:
         for match in s.matches:
@@ -182,7 +181,7 @@ def _one_by_one(usable: Sequence[Scanned]) -> Seen:
     matches = [
         replace(match, score=table[match.train.name, match.reverse]) for match in fine[0].matches
     ]
-    return Seen(matches, direction, kept, offsets)
+    return Seen(matches, direction, kept)
 
 
 def _motion(match: Match) -> Motion:
@@ -201,14 +200,16 @@ def recentred(match: Match) -> Motion:
     return _motion(match).moved(float(0.5 * (times[0] + times[-1])))
 
 
-def _delays(
-    usable: Sequence[Scanned], best: Match
-) -> tuple[int, list[tuple[Scanned, float]], list[tuple[str, float, float]]]:
-    """Direction by the order of the channels; the delays (s) of those whose clock can be right."""
+def _delays(usable: Sequence[Scanned], best: Match) -> tuple[int, list[tuple[Scanned, float]]]:
+    """Direction by the order of the channels, and their delays (s).
+
+    A delay that no speed explains is kept: whether a clock or the type is wrong is for the evidence
+    to say.
+    """
     reference = usable[0]
     kept = [(reference, 0.0)]
     votes: list[int] = []
-    offsets: list[tuple[str, float, float]] = []
+    doubted: list[int] = []
     for s in usable[1:]:
         delays = [
             float(np.median(m.times() - best.times()))
@@ -221,16 +222,17 @@ def _delays(
         expected = min(
             (baseline / best.speed, -baseline / best.speed), key=lambda e: abs(delay - e)
         )
+        kept.append((s, delay))
         if abs(baseline) < 0.5:
-            kept.append((s, delay))
-        elif abs(delay - expected) * best.speed < 0.8 or 1 / _STRETCH < delay / expected < _STRETCH:
-            votes.append(1 if delay * baseline > 0 else -1)
-            kept.append((s, delay))
-        else:
-            offsets.append((s.trace.name, delay - expected, 0.5 / best.speed))
+            continue
+        fits = (
+            abs(delay - expected) * best.speed < 0.8 or 1 / _STRETCH < delay / expected < _STRETCH
+        )
+        (votes if fits else doubted).append(1 if delay * baseline > 0 else -1)
+    votes = votes or doubted
     if votes and abs(sum(votes)) != len(votes):
-        return 0, [(reference, 0.0)], offsets
-    return (votes[0] if votes else 0), kept, offsets
+        return 0, [(reference, 0.0)]
+    return (votes[0] if votes else 0), kept
 
 
 def see(

@@ -18,10 +18,6 @@ from .record import Record
 from .single import Shown
 from .strength import excited, quiet_gaps
 
-CLOCK_SCORE = 0.85
-"""Least pattern correlation at which a clock, and not an unlisted train, is held responsible for
-delays that no type explains: patterns of unlisted trains correlate with listed ones up to 0.83."""
-
 _EXACT = 0.1  # m, scatter of wheelsets at which no unlisted train is mistaken for their type
 _AROUND_S = 0.5  # s, of an interval of strong energy that belongs to its train
 
@@ -62,14 +58,17 @@ def find_passage(
         passage = Passage(reference.interval, traces, reference.band, (), 0, coarse_score=top)
     else:
         passage = fit_hypotheses(usable, trains, limits, site)
-    off = bool(passage.clock_offset)
-    if not unlisted or (passage.known and not (off and passage.score < CLOCK_SCORE)):
+    if unlisted and passage.known and passage.clock_offset:
+        # that its delay fits no type may be for the train is none of them
+        own = next(r for r in records if r.channel.name == passage.traces[0].name)
+        passage = _described(own, within, passage, limits, site)
+    if not unlisted or passage.known:
         return passage
     if len(records) < 2:
         return passage
     blind = describe(records, within, reference.interval, limits, reference.trace.limited)
     blind = blind and at_site(blind, site)
-    if blind is not None and blind.travels and off:
+    if blind is not None and blind.travels and passage.clock_offset:
         # an unlisted train is likelier than a pattern at either channel and a wrong clock
         return replace(
             passage,
@@ -79,8 +78,6 @@ def find_passage(
             quality=(),
             blind=blind,
         )
-    if passage.known:
-        return passage
     return replace(passage, blind=blind)
 
 
@@ -185,6 +182,8 @@ def _divided(
         return [whole]
     # a part in which something travels gives the whole most of its delay
     travels = whole.known or (whole.blind is not None and whole.blind.direction != 0)
+    # what travels as one train is not two before a sensor that is late, or elsewhere
+    one = whole.blind is not None and whole.blind.travels
     for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
@@ -192,6 +191,8 @@ def _divided(
         for half in halves:
             part = find_passage(rails, half, types, limits, site, unlisted and travels)
             if part is None or not part.confirmed:
+                break
+            if one and (part.clock_offset or part.moved):
                 break
             parts.append(part)
         better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1

@@ -63,7 +63,7 @@ def speed(passage: Passage) -> Speed:
     def part(probability: float, motion: Motion) -> Part:
         return probability, float(motion.speed_at(when)), motion.speed_sigma(when)
 
-    parts = [part(e.probability, e.motion) for e in passage.explanations if e.kind != "clock"]
+    parts = [part(e.probability, e.motion) for e in passage.explanations]
     held = _held(passage)
     if passage.known:
         meant = [part(h.probability, h.fit.motion) for h in held]
