@@ -26,7 +26,7 @@ CONFIDENT = 0.8
 _PULSE_CELLS = 60  # of :data:`travel.CELL`
 _BEAM = 1.2  # 1/m, sqrt^4(k/4EI) of a rail on fastenings of 40 to 100 kN/mm every 0.65 m
 _EXPLAINED = 0.9  # of a signal's variance, at which no other is needed
-_BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other
+_BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other, usual 1
 _PARTNER = 3.6  # m, the other wheelset of a bogie, or of the next one
 _PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bogies are seen
 _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
@@ -224,6 +224,9 @@ def _two_channels(
         return None
     wheelsets, first, second = best
     levels = np.stack([heights(first, wheelsets), heights(second, wheelsets)])
+    usual = np.median(levels, axis=1, keepdims=True)
+    if np.all(usual > 0):  # noise may let less of all of them be seen at one channel
+        levels = levels / usual
     both = levels.min(axis=0) > _BOTH * np.abs(levels).max(axis=0)
     start = float(pair.axis(found.motion, found.direction)[0]) + 0.5 * travel.CELL
     motion, places, place_sigma = _placed(a, b, found, start + wheelsets.place)
