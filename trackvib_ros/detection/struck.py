@@ -51,6 +51,7 @@ _MOST_BENDS = 4  # to either side: two of the coarse ones
 _FINE_STEP, _FINE = 0.001, 12  # relative; steps to either side, three of the coarse ones
 _RIVAL = 8.0  # ln of odds beyond which another type need not be looked at closely
 _CHANCE = 1e-3  # of a train that is none, all trials counted
+_LEAST_HEARD = 0.5  # of the time that the train takes
 _LEAST_APART = 0.5  # m, of channels that tell a direction
 _PLACE = 0.15  # m, of a channel by energies
 
@@ -112,7 +113,15 @@ def find(
         min(float(r.window.time[-1]) for r in records),
     )
     found = _search(channels, span, within[1] - within[0], trains, (low, high))
-    return _passage(found, records, within, band) if found else None
+    if not found:
+        return None
+    passage = _passage(found, records, within, band)
+    time = passage.hypotheses[0].fit.time
+    start, stop = float(time.min()), float(time.max())
+    heard_s = min(within[1], stop) - max(within[0], start)
+    # flats are anywhere in a train, and all of it is on record
+    whole = span[0] < start and stop < span[1]
+    return passage if whole and heard_s > _LEAST_HEARD * (stop - start) else None
 
 
 def _search(
@@ -277,9 +286,11 @@ def _turn(
         round(2 * np.pi * r / v / step) for r, v in zip(_RADIUS, limits[::-1], strict=True)
     )
     lag = first + int(np.argmax(total[first : last + 1]))
-    if total[lag] < _REPEATED * len(records):
+    again = float(np.max(total[2 * lag - 2 : 2 * lag + 3]))
+    if total[lag] < _REPEATED * len(records) or again < 0.5 * _REPEATED * len(records):
         return None
-    return lag * step
+    # at the edge of what is looked for it is a slow change, no peak
+    return lag * step if total[lag] >= max(total[lag - 1], total[lag + 1]) else None
 
 
 def _heard(record: Record, within: tuple[float, float], band: int) -> _Heard | None:
@@ -293,13 +304,17 @@ def _heard(record: Record, within: tuple[float, float], band: int) -> _Heard | N
     if not inside.any() or np.mean(weight[inside] == 1.0) < _LEAST_QUIET:
         return None
     energy = np.minimum(energy, _CAP)
-    # what blows leave in sums over the length of a wheelset is noise as well
+    # what blows leave in sums over the length of a wheelset is noise as well, and what begins or
+    # ends beside them
     few = round(_SPREAD_S / window.step)
     mean = ndimage.uniform_filter1d(weight * energy, 6 * few)
     mean /= np.maximum(ndimage.uniform_filter1d(weight, 6 * few), 1e-9)
-    rows = np.flatnonzero(inside)[: inside.sum() // few * few].reshape(-1, few)
-    away = np.sum((weight * (energy - mean))[rows], axis=1)
-    variance = float(np.sum(away**2) / np.sum(weight[rows]))
+    rows = energy.size // few
+    away = (weight * (energy - mean))[: rows * few].reshape(rows, few).sum(axis=1)
+    weights = weight[: rows * few].reshape(rows, few).sum(axis=1)
+    loud = np.add.reduceat(inside[: rows * few], np.arange(0, rows * few, few)) > 0
+    parts = [np.sum(away[p] ** 2) / max(np.sum(weights[p]), 1e-9) for p in (loud, ~loud)]
+    variance = float(np.max(parts))
     edges = np.append(time - window.step / 2, time[-1] + window.step / 2)
     return _Heard(
         record.channel.x,
