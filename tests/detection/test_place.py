@@ -47,6 +47,15 @@ def test_a_clean_pulse_is_placed_within_a_centimetre(speed, acceleration):
         assert sigma[0] < 0.03
 
 
+@pytest.mark.parametrize("error", [-1.9, 1.9])
+def test_a_channel_is_placed_though_its_energies_are_most_of_a_wheelbase_off(error):
+    for seed in range(4):
+        given, motion = wave(45.0, error, 1.0, seed)
+        shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.07]))
+        # the deflection of the next wave, 1.2 m off, was told for it where the search ended
+        assert abs(shift[0] - error) < 3 * sigma[0] < 0.15
+
+
 def test_the_lead_of_an_ac_coupling_is_taken_out():
     given, motion = wave(16.0, 0.0, 0.02, 0, coupling=2.0)
     shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.5]))

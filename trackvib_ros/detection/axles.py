@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from .coherent import wheelsets
-from .kinematics import Fit, Motion, regress
+from .kinematics import PULSE_PLACE_SIGMA, Fit, Motion, regress
 from .pattern import Trace
 from .place import CLIPPED_SIGMA, Wave, likelihood, locate
 
@@ -213,6 +213,13 @@ def _by_deflection(
     return time, fit.motion, found.gain
 
 
+def _position(place_sigma: Array) -> float:
+    """How far a channel may be from its place (m): free where deflections told it, to be judged
+    with the distances between the channels."""
+    placed = float(np.max(place_sigma)) < PULSE_PLACE_SIGMA
+    return _FREE_POSITION if placed else PULSE_PLACE_SIGMA
+
+
 def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
     """The wheelset times of one type under another of the same number of wheelsets.
 
@@ -222,7 +229,11 @@ def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
     """
     seen = fit.observed
     again = regress(
-        fit.time[seen], np.stack(list(places))[seen], np.nonzero(seen)[0], fit.motion.epoch
+        fit.time[seen],
+        np.stack(list(places))[seen],
+        np.nonzero(seen)[0],
+        fit.motion.epoch,
+        position_sigma=_position(fit.place_sigma),
     )
     residual = np.zeros(seen.shape)
     residual[seen] = again.residual
@@ -328,7 +339,13 @@ def fit_axles(
         more, place_sigma = locate(tables, scales)
         place_sigma[[wave.clipped for wave in waves]] += CLIPPED_SIGMA
         time += more[:, None] / pace
-        fit = regress(time[observed], np.stack(list(places))[observed], channel, motion.epoch)
+        fit = regress(
+            time[observed],
+            np.stack(list(places))[observed],
+            channel,
+            motion.epoch,
+            position_sigma=_position(place_sigma),
+        )
         residual[observed] = fit.residual
     return AxleFit(
         motion=motion if fit is None else fit.motion,

@@ -30,6 +30,10 @@ from .kinematics import Motion
 
 Array = NDArray[np.float64]
 
+REACH = 2.5
+"""How far from its expected place (m) the deflection is looked for: energies are timed within
+1.1 m, their axis of symmetry is sought within 1 m, a coupling leads by a third."""
+
 _STEP = 0.1  # m
 _WAVENUMBERS = (1.0, 5.0)  # rad/m: shorter waves are roughness, longer ones the bridge and the cars
 _STIFFNESS = (1.4,)  # rad/m, k0 = (foundation / bending stiffness)^(1/4); 1.2 to 1.9 on ballastless
@@ -37,8 +41,7 @@ _STIFFNESS = (1.4,)  # rad/m, k0 = (foundation / bending stiffness)^(1/4); 1.2 t
 _STIFFNESS_CLIPPED, _TOP_CLIPPED = (0.9, 1.4, 2.2), 7.0
 _TAPER = 8.0  # m beyond the outer wheelsets
 _COUPLINGS = np.arange(0.0, 3.01, 0.5)  # Hz, edges of the AC coupling of accelerometers
-_REACH = 1.3  # m
-_SHIFTS = np.arange(-_REACH, _REACH + 0.01, 0.02)
+_SHIFTS = np.arange(-REACH, REACH + 0.01, 0.02)
 _SAMPLES = 2.5  # per wavelength at least
 _BAND = 0.5  # rad/m, of one level of noise
 _LINES = 2.0  # shape of the distribution of its variance; heavy tails, with a mean
