@@ -7,11 +7,11 @@ from tests.detection.synthetic import CATALOGUE, RAILS, Passage, record
 from trackvib_ros.detection.delay import find_delay, log_ratio
 from trackvib_ros.detection.features import GroupStream
 from trackvib_ros.detection.record import Record
-from trackvib_ros.detection.travel import PLACE_SIGMA
 from trackvib_ros.waveform import Waveform
 
 RATE = 2000
 LIMITS = (10.0, 115.0)
+APART = (20.0, 0.0)
 
 
 def records(samples, floor):
@@ -28,8 +28,8 @@ def records(samples, floor):
     return out
 
 
-def train(seed, kind, snr, seen, name=None):
-    """A train of which ``seen`` metres have passed both channels."""
+def train(seed, kind, snr, seen, name=None, apart=APART):
+    """A train of which ``seen`` metres have passed both channels, ``apart`` as is thought."""
     rng = np.random.default_rng(seed)
     name = name or ("CRH3", "articulated", "metro", "locomotive_hauled")[seed % 4]
     direction = 1 if seed % 2 else -1
@@ -40,7 +40,7 @@ def train(seed, kind, snr, seen, name=None):
     now = max(first) + seen / truth.speed
     quiet = samples[: round((min(first) - 0.5) * RATE)]
     both = records(samples[: round(now * RATE)], float(quiet.var()))
-    return truth, find_delay(*both, (min(first) - 0.3, now), LIMITS)
+    return truth, find_delay(*both, (min(first) - 0.3, now), LIMITS, apart)
 
 
 def test_the_ratio_is_one_on_average_without_a_correlation():
@@ -60,9 +60,7 @@ def test_the_delay_tells_speed_and_direction_within_its_sigma(kind, seen):
     found = [(truth, delay) for truth, delay in told if delay is not None]
     assert len(found) >= 5  # others are told at a later trial
     assert all(delay.direction == truth.direction for truth, delay in found)
-    # computed pulses stand exactly where they should
-    exact = [np.sqrt(delay.sigma**2 - (PLACE_SIGMA / 20 * delay.speed) ** 2) for _, delay in found]
-    z = [(found[i][1].speed - found[i][0].speed) / exact[i] for i in range(len(found))]
+    z = [(delay.speed - truth.speed) / delay.sigma for truth, delay in found]
     rms = np.sqrt(np.mean(np.square(z)))
     # of five or more the rms lies between 0.33 and 1.74 at 98 % (chi squared)
     assert rms < 1.74
@@ -80,6 +78,14 @@ def test_cars_as_long_as_the_channels_are_apart_are_not_taken_for_each_other():
         assert delay.speed == pytest.approx(truth.speed, rel=0.01)
 
 
+def test_what_is_known_of_the_distance_is_in_the_speed_and_its_sigma():
+    (_, exact), (_, other) = (train(1, "pulse", 20, 45.0, apart=x) for x in (APART, (20.2, 0.1)))
+    # the delay is the same: speed goes with the distance, but for the trials that it moves
+    assert other.speed == pytest.approx(1.01 * exact.speed, rel=2e-4)
+    relative = np.hypot(exact.sigma / exact.speed, 0.1 / 20.2)
+    assert other.sigma / other.speed == pytest.approx(relative, rel=0.05)
+
+
 @pytest.mark.parametrize("kind", ["noise", "blow", "hum"])
 def test_what_is_no_train_has_no_delay(kind):
     for seed in range(8):
@@ -92,4 +98,4 @@ def test_what_is_no_train_has_no_delay(kind):
                 samples += 30 * (ring * np.sin(600 * (time - at)))[:, None]
         if kind == "hum":
             samples += 5 * np.sin(2 * np.pi * rng.uniform(5, 200) * time)[:, None]
-        assert find_delay(*records(samples, 1.0), (1.0, 3.0), LIMITS) is None
+        assert find_delay(*records(samples, 1.0), (1.0, 3.0), LIMITS, APART) is None

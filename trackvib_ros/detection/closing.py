@@ -106,7 +106,7 @@ class Closing:
         elif ended.cut and len(found) <= 1:
             rails = [r for r in records if r.channel.layer == "rail"]
             stop = (ended.now_ns - ended.origin_ns) * 1e-9
-            head = arrived(rails, (within[0], stop), self._limits, self._heads)
+            head = arrived(rails, (within[0], stop), self._limits, self._heads, self.calibration)
             # on one channel a beginning looks like that of other types at other speeds
             if head is not None and head.direction and not _passed(found, within, head):
                 return report.truncated(self._catalogue, head, ended.origin_ns, ended.now_ns)
@@ -164,7 +164,7 @@ class Closing:
         """
         last_ns, end = ended.last_ns, (ended.now_ns - start_ns) * 1e-9
         within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
-        found, late = departed(rails, within, self._limits, self._mirrored)
+        found, late = departed(rails, within, self._limits, self._mirrored, self.calibration)
         if found is not None and found.end is not None:
             quiet_s = end - found.end[0]
             if (

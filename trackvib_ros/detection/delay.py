@@ -28,13 +28,13 @@ from scipy import fft, ndimage
 from scipy.interpolate import CubicSpline
 
 from .pattern import Trace
+from .place import DEFLECTION_SIGMA
 from .record import Record
 from .strength import strong_interval
 from .travel import (
     BROAD,
     CELL,
     ENERGY_PLACE_SIGMA,
-    PLACE_SIGMA,
     Series,
     band_pass,
     deflection,
@@ -326,7 +326,11 @@ class _Likely:
 
 
 def find_delay(
-    first: Record, second: Record, within: tuple[float, float], limits: tuple[float, float]
+    first: Record,
+    second: Record,
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    apart: tuple[float, float],
 ) -> Delay | None:
     """The speed that the delays between two channels tell; ``None`` if it is not clear.
 
@@ -335,8 +339,9 @@ def find_delay(
         second: the other.
         within: start of the event and now (s).
         limits: speeds (m/s).
+        apart: distance of the channels, its standard uncertainty (m).
     """
-    baseline = second.channel.x - first.channel.x
+    baseline = apart[0]
     # a record that begins inside a train begins in both channels at once
     known = [record.window.time[record.window.valid] for record in (first, second)]
     if not all(time.size for time in known):
@@ -376,7 +381,8 @@ def find_delay(
     among = np.exp(weights[:-1] - _log_sum(weights[:-1]))
     errors = np.array([direction * np.sign(item.delay) * item.speed - speed for item in moving])
     errors[k] = float(np.sqrt(weight @ (speeds - speed) ** 2))
-    sigma = float(np.hypot(np.sqrt(among @ errors**2), PLACE_SIGMA * speed / baseline))
+    place = float(np.hypot(apart[1], 2**0.5 * DEFLECTION_SIGMA)) / baseline
+    sigma = float(np.hypot(np.sqrt(among @ errors**2), place * speed))
     sure = float(among[k]) / (1 + np.exp(-travels))
     return Delay(speed, sigma, direction, sure, best.trial.band(best.delay))
 

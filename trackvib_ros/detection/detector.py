@@ -542,7 +542,8 @@ class TrainDetector:
             return []
         origin = event.start_ns - _BEFORE_NS
         within = ((event.start_ns - origin) * 1e-9 - 0.5, (now_ns - origin) * 1e-9)
-        found = provisional(self._rails(event, origin, now_ns), within, self._limits, self._heads)
+        rails = self._rails(event, origin, now_ns)
+        found = provisional(rails, within, self._limits, self._heads, self.calibration)
         if found is None or not _enough(found, event.updates):
             return []
         event.updates += 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .calibration import Calibration
 from .delay import find_delay
 from .head import MOST_UNCERTAIN, Head, HeadMatcher
 from .pattern import Trace
@@ -58,6 +59,7 @@ def provisional(
     within: tuple[float, float],
     limits: tuple[float, float],
     matcher: HeadMatcher,
+    site: Calibration,
 ) -> Partial | None:
     """Speed while the train passes: by the delay between the outer two rail channels, or by the
     axle pattern if only one has a signal. ``None`` while it is not clear.
@@ -67,7 +69,7 @@ def provisional(
         key=lambda r: r.channel.x,
     )
     if len(rails) >= 2 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
-        return _by_delay(rails[0], rails[-1], within, limits)
+        return _by_delay(rails[0], rails[-1], within, limits, site)
     if not rails:
         return None
     found = _by_pattern(rails[0], within, matcher)
@@ -77,9 +79,15 @@ def provisional(
 
 
 def _by_delay(
-    a: Record, b: Record, within: tuple[float, float], limits: tuple[float, float]
+    a: Record,
+    b: Record,
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    site: Calibration,
 ) -> Partial | None:
-    found = find_delay(a, b, within, limits)
+    offset, covariance = site.relative([a.channel.name, b.channel.name])
+    baseline = b.channel.x - a.channel.x + float(offset[1])
+    found = find_delay(a, b, within, limits, (baseline, float(covariance[1, 1]) ** 0.5))
     if found is None or found.sigma > MOST_UNCERTAIN * found.speed:
         return None
     # what both channels have seen of the train
@@ -134,6 +142,7 @@ def departed(
     within: tuple[float, float],
     limits: tuple[float, float],
     mirrored: HeadMatcher,
+    site: Calibration,
 ) -> tuple[Partial | None, float]:
     """A train whose beginning is not on record, by the pattern of its end.
 
@@ -142,6 +151,7 @@ def departed(
         within: start of the record, end of the event (s).
         limits: speeds (m/s).
         mirrored: for trains read from their end.
+        site: where the channels are.
 
     Returns:
         ``None`` if it shows no clear pattern; and how long the record is quiet at its start (s),
@@ -167,7 +177,7 @@ def departed(
         return None, np.inf
     found = _of_head(head, record, "axle pattern of the end of the train")
     found = replace(found, end=(end, _edge_sigma(head)))
-    return _with_delay(found, rails, within, limits), quiet
+    return _with_delay(found, rails, within, limits, site), quiet
 
 
 def arrived(
@@ -175,6 +185,7 @@ def arrived(
     within: tuple[float, float],
     limits: tuple[float, float],
     matcher: HeadMatcher,
+    site: Calibration,
 ) -> Partial | None:
     """A train that still passes when the record ends, by the pattern of its beginning.
 
@@ -183,6 +194,7 @@ def arrived(
         within: the event, to the end of the record (s).
         limits: speeds (m/s).
         matcher: for the first wheelsets.
+        site: where the channels are.
 
     Returns:
         ``None`` if it shows no clear pattern, or if the record ends so quiet that it has passed.
@@ -203,7 +215,7 @@ def arrived(
     head, record, _ = best
     found = _of_head(head, record, "axle pattern of the beginning of the train")
     found = replace(found, start=(head.start, _edge_sigma(head)))
-    return _with_delay(found, rails, within, limits)
+    return _with_delay(found, rails, within, limits, site)
 
 
 def _edge_sigma(head: Head) -> float:
@@ -231,11 +243,12 @@ def _with_delay(
     rails: Sequence[Record],
     within: tuple[float, float],
     limits: tuple[float, float],
+    site: Calibration,
 ) -> Partial:
     """What a pattern told, and the delay between the outer two channels if it agrees."""
     delay = None
     if len(rails) > 1 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
-        delay = _by_delay(rails[0], rails[-1], within, limits)
+        delay = _by_delay(rails[0], rails[-1], within, limits, site)
     if delay is None or abs(delay.speed - found.speed) > 3 * np.hypot(delay.sigma, found.sigma):
         return found
     weight = np.array([found.sigma, delay.sigma]) ** -2.0
