@@ -97,9 +97,13 @@ def test_wheelsets_elsewhere_contradict_a_type():
     assert blind.contradicts(moved, motion, wave)
     assert blind.contradicts(PLACES[2:], motion, wave)
     assert blind.contradicts(PLACES[:-2], motion, wave)
-    # what is in doubt itself contradicts nothing
-    assert not replace(blind, regular=0.5).contradicts(moved, motion, wave)
-    # nor do bogies that were missed, where a type explains the deflection with them
+    # what clipping has cut off, a hole hides, or no deflection shows, contradicts nothing
+    assert not blind.contradicts(moved, motion, replace(wave, clipped=True))
+    here = np.abs(motion.distance_at(wave.time)[:, None] - [[0.0, 2.5, 5.0, 7.5]]).min(axis=1) < 2
+    assert not blind.contradicts(moved, motion, replace(wave, valid=~here))
+    noise = np.random.default_rng(3).standard_normal(wave.time.size)
+    assert not blind.contradicts(moved, motion, replace(wave, value=noise))
+    # nor do bogies that it missed itself, where a type explains the deflection with them
     for k in (0, 8, PLACES.size - 2):
         fewer = replace(blind, times=np.delete(blind.times, [k, k + 1]))
         assert not fewer.contradicts(PLACES, motion, wave)

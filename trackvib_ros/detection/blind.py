@@ -34,6 +34,7 @@ _LEAST_WORTH = 25.0  # e^25 outweighs the speeds and pulses tried, as for two ch
 _LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right than wrong
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
 _BOGIE = 2  # wheelsets
+_SHOWN = 0.9  # of the two metres about a wheelset, to be measured
 _CARRIED = 4.0  # m, strong energy before the first wheelset and behind the last (0 to 3.4 m)
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
@@ -84,34 +85,48 @@ class Blind:
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
 
     def contradicts(self, places: Array, motion: Motion, wave: Wave) -> bool:
-        """Whether a bogie or more of this train, beyond doubt, is not where a type has one.
+        """Whether a bogie or more of this train is not where a type has one.
 
-        Of wheelsets that only one of the two has, those of this train must explain more of the
-        deflection than their places and loads cost (two unknowns each, Bayesian information), or
-        those of the type less than their loads do: else they were missed, or found by chance.
+        The deflection must show this train. Of wheelsets that only one of the two has, those of
+        this train must explain more of the deflection than their places and loads cost (two
+        unknowns each, Bayesian information), or those of the type less than their loads do: else
+        they were missed, or found by chance. What a hole of the record hides is not missing, and a
+        deflection that clipping cut off tells neither.
 
         Args:
             places: of the type's wheelsets, in order (m).
             motion: of the type past the reference point.
             wave: low-passed waveform of the channel.
         """
-        if not self.travels or self.regular < CONFIDENT:
+        if wave.clipped:
             return False
-        own = motion.distance_at(self.times)
-        apart = np.abs(own[:, None] - places[None, :])
-        own, listed = own[apart.min(axis=1) > _ELSEWHERE], apart.min(axis=0) <= _ELSEWHERE
+        every = motion.distance_at(self.times)
+        apart = np.abs(every[:, None] - places[None, :])
+        own = every[apart.min(axis=1) > _ELSEWHERE]
+        own = own[_measured(wave, motion, own) >= _SHOWN]
+        listed = apart.min(axis=0) <= _ELSEWHERE
+        listed |= _measured(wave, motion, places) < _SHOWN
         more, fewer = own.size, int(np.sum(~listed))
-        every = np.sort(np.append(places, own))
-        first, last = motion.time_at(every[[0, -1]])
-        cost = 0.5 * float(np.log(every.size))
+        both = np.sort(np.append(places, own))
+        first, last = motion.time_at(both[[0, -1]])
+        cost = 0.5 * float(np.log(both.size))
 
         def gain(at: Array) -> float:
             fine = compared(wave, motion.time_at(at), motion.speed, (float(first), float(last)))
             return -np.inf if fine is None else fine.gain
 
-        if more >= _BOGIE and gain(every) - gain(places) > 2 * cost * more:
+        if max(more, fewer) < _BOGIE or gain(every) < 2 * cost * every.size:
+            return False
+        if more >= _BOGIE and gain(both) - gain(places) > 2 * cost * more:
             return True
         return fewer >= _BOGIE and gain(places) - gain(places[listed]) < cost * fewer
+
+
+def _measured(wave: Wave, motion: Motion, places: Array) -> Array:
+    """Measured part of the metre on either side of every wheelset."""
+    total = np.concatenate([[0.0], np.cumsum(wave.valid)])
+    first, last = np.searchsorted(wave.time, motion.time_at(np.stack([places - 1, places + 1])))
+    return np.asarray((total[last] - total[first]) / np.maximum(last - first, 1))
 
 
 def describe(
@@ -313,7 +328,9 @@ def describe_alone(shown: Shown) -> Blind | None:
         regular=found.certainty if whole else min(found.certainty, 0.5),
         direction=0,
         correlation=0.0,
+        # what clipping leaves of a deflection has another width
         travels=found.corner is not None
+        and not shown.wave.clipped
         and found.corner.worth(2) > _LEAST_WORTH
         and found.certainty > _LIKELY
         and found.bogies.clear

@@ -28,6 +28,7 @@ from scipy import fft
 
 from . import travel
 from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD, Corner, corner, low_pass
+from .health import clipped
 from .kinematics import PRIOR_ACCELERATION, Motion
 from .pattern import Trace
 from .place import Wave
@@ -120,7 +121,8 @@ class Shown:
     def wave(self) -> Wave:
         """The waveform below 100 Hz."""
         window = self.record.window
-        return Wave(window.time - window.low_shift, window.low, window.measured)
+        cut = clipped(window, (window.time >= self.within[0]) & (window.time <= self.within[1]))
+        return Wave(window.time - window.low_shift, window.low, window.measured, cut)
 
     @property
     def quiet(self) -> float:
