@@ -42,6 +42,7 @@ def check(s: StandIn, events):
     (arrival,) = of(events, "arrival")
     first = min(s.axle_times(c.x)[0] for c in s.channels)
     assert arrival.stamp_ns * 1e-9 < first + 0.1
+    assert "overlap" not in passage.quality
     return passage
 
 
@@ -77,6 +78,17 @@ def test_a_sensor_that_is_elsewhere_does_not_tell_the_speed():
     speed = passage.values["speed"]
     assert abs(speed.value - s.mid_speed(0.0)) < 3 * speed.sigma < 0.03 * speed.value
     assert {"moved", "unsynchronised"} & set(passage.quality)
+
+
+def test_what_goes_on_beside_a_train_is_told():
+    s = stand_in(SEEDS["figures"] + 41, "none", "roomy", 1000.0, 2, snr_db=25, train="class_425")
+    last = float(s.axle_times(0.0)[-1])
+    beside = (s.time > last - 1.0) & (s.time < last + 2.5)
+    level = 0.4 * np.std(s.samples[np.abs(s.time - last) < 1.0])
+    s.samples[beside] += level * s.random.standard_normal((int(beside.sum()), 2))
+    (passage,) = of(detect(s.rate, s.samples, s.channels, KNOWN), "passage")
+    assert passage.values["type"] == "class_425"
+    assert "overlap" in passage.quality
 
 
 def test_a_tight_record_in_blocks_of_any_size():

@@ -199,7 +199,22 @@ def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
             flags.add("truncated_start")
         if window.time[-1] - stop < margin:
             flags.add("truncated_end")
+    if passage.known and _overlapped(passage):
+        flags.add("overlap")
     return sorted(flags)
+
+
+def _overlapped(passage: Passage) -> bool:
+    """Whether strong energy goes on beside a train of a known type, as that of another one does.
+
+    What the rail carries is heard before the first wheelset as behind the last; what is heard on
+    one side for longer than the longest gap of the train is no wheelset of it.
+    """
+    best = passage.hypotheses[0]
+    strong = best.fit.motion.distance_at(np.array(passage.interval))
+    ahead, behind = strong - best.places[[0, -1]]
+    longest = float(np.max(np.diff(best.places)))
+    return bool(abs(max(behind, 0.0) - max(-ahead, 0.0)) > longest)
 
 
 def _prefer_blind(passage: Passage, blind: Blind) -> bool:
