@@ -6,14 +6,23 @@ that are known beforehand: the bowl of the deflection (:mod:`bowl`), the wheelba
 the length of cars. Their product over a grid of speeds is the posterior of the speed.
 
 How well can that be known? A train of free places and loads gives the product k0 v (:mod:`bowl`)
-and the wheelbase in seconds, b / v, and nothing else in its record has a length. Noise apart, the
-Cramér-Rao bound of ln v is that of these two measurements with the priors of k0 and b,
+and the wheelbase in seconds, b / v. Noise apart, the Cramér-Rao bound of ln v by these two
+measurements, with the priors of k0 and b, is
 
     sigma^-2 = (s_k² + s_s²)^-1 + (s_b / b)^-2,
 
 with s_k = 0.13 of k0 (pads), s_s = 0.04 of its shape and s_b / b = 0.25 / 2.5: 8 % on a site that
 has taught nothing (95 % within 16 %), 3.8 % where listed trains have taught k0 to 1 %. An error of
 2 % at 95 % is out of reach of one rail without a length that is known.
+
+The spacing of fastenings would be one, but at a fixed point their passing is hardly a line: a
+wheelset is near the sensor for some three bays, and roughness in these comes again with every
+wheelset. In 54 computed passages at 40 dB the pulse common to all wheelsets has, at 1.06 waves per
+bay, a hump of 7 dB with a Timoshenko rail, none with an Euler-Bernoulli one. Waves of 0.3 to 0.45 m
+repeat from train to train (coherence 0.9 and 0.2): with the whole pulse of the site taken from
+other trains its width told the speed to 1.5 % (median; one in ten beyond 3.6 %) and 3.5 % (9 %) at
+40 dB, to 5 % (beyond 20 %) and 16 % at 10 dB. Most of it is above the 100 Hz that are kept, and is
+not used.
 """
 
 from __future__ import annotations
