@@ -46,8 +46,24 @@ def test_the_motion_is_found_from_a_start_that_is_metres_off(speed):
     assert np.max(np.abs(start.distance_at(motion.time_at(AXLES)) - AXLES)) > 0.8
     found = wheelsets(waves, PLACES, start)
     late = [found.motion.distance_at(motion.time_at(own)) - own for own in PLACES]
-    # steps of 0.15 m at the ends and 0.1 m of the whole
-    assert np.max(np.abs(late)) < 0.15
+    # one step each: 0.15 m at the ends and 0.1 m of the whole
+    assert np.max(np.abs(late)) < 0.25
+
+
+def test_braking_is_found_from_a_start_at_constant_speed():
+    """A bend of 2.9 m: a pattern scanned at constant speed is 1.4 m off at the ends."""
+    speed, braking = 33.0, -0.66
+    waves, motion = passage(speed, braking, 0.2, 1)
+    middle = float(motion.time_at(0.5 * AXLES[-1]))
+    half = 0.5 * AXLES[-1]
+    bend = -0.5 * braking * (half / speed) ** 2
+    at = motion.moved(middle)
+    start = Motion(middle, at.distance - 0.5 * bend, at.speed, 0.0, np.eye(3))
+    found = wheelsets(waves, PLACES, start)
+    late = [found.motion.distance_at(motion.time_at(own)) - own for own in PLACES]
+    assert bend > 2.5
+    # one step each: 0.15 m at the ends, 0.15 m of the bend, half of it there, 0.1 m of the whole
+    assert np.max(np.abs(late)) < 0.325
 
 
 def test_deviations_of_wheelsets_are_measured_and_their_sigma_holds():

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from trackvib_ros.detection.pattern import Integral, Trace, lasting
+from trackvib_ros.detection import Catalogue
+from trackvib_ros.detection.passage_scan import Scanned, _alone
+from trackvib_ros.detection.pattern import Integral, Match, Trace, lasting
+from trackvib_ros.detection.place import Wave
 
 
 @pytest.mark.parametrize("gap", [0.0, 7.0])
@@ -45,3 +48,21 @@ def test_blows_do_not_last():
     slack = 10 ** (0.09 * 50.0 * 0.05)
     assert np.all(rest < slack * hum) and np.all(rest > hum / slack)
     np.testing.assert_array_equal(lasting(np.full(500, 3.0), step), 3.0)
+
+
+def test_a_wrong_clock_is_asked_of_one_type():
+    """Two channels that look most like a type each, and less like the same one."""
+    types = Catalogue.default()
+    zero = np.zeros(1)
+    trace = Trace("a", 0.0, zero, zero, zero == 0, 1.0, 1.0)
+    wave = Wave(zero, zero, zero == 0)
+
+    def scanned(**scores):
+        matches = [
+            Match(score, types[name], False, 0.0, 0.0, 60.0, 0.0) for name, score in scores.items()
+        ]
+        return Scanned(trace, trace, wave, (5.0, 150.0), (0.0, 1.0), (0.8, 1.2), matches)
+
+    channels = [scanned(CRH3=0.9, metro=0.6), scanned(CRH5=0.9, metro=0.5)]
+    assert _alone(channels) == pytest.approx(0.5 * (np.log(0.64) + np.log(0.75)))
+    assert _alone([scanned(CRH3=0.9), scanned(CRH5=0.9)]) == 0.0

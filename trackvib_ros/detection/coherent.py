@@ -28,7 +28,7 @@ _PULSES = (0.9, 1.4, 2.2)  # rad/m, k0 of stiff to soft foundations; clipping fl
 _END = 0.15  # m, step of the grid at the ends of a train: a tenth of the shortest wave
 _SPEED_REACH = 0.01  # relative, two steps of the finest scan of energies
 _PLACE_REACH = 1.5  # m
-_BEND_REACH = 1.5  # m
+_BEND_REACH = 3.0  # m, half of it off at the ends and in the middle
 _FINE = 0.05  # m, of the filtered waveform
 _TRIALS = 10.0  # ln of the number of independent cells of the grid, some 30 x 20 x 10 and the types
 

@@ -158,7 +158,8 @@ class Passage:
             return False
         fit = self.hypotheses[0].fit
         seen = np.sum(fit.observed & (fit.contrast > SEEN), axis=1)
-        if fit.in_phase > IN_PHASE and self.direction != 0:
+        shown = max(fit.in_phase, self.hypotheses[0].phase if self.unknown < 0.5 else 0.0)
+        if shown > IN_PHASE and self.direction != 0:
             return self.score >= IN_STEP_SCORE
         if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))):
             return False

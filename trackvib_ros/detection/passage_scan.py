@@ -153,7 +153,7 @@ def _in_step(
     factors = np.exp(np.arange(-np.log(_STRETCH), np.log(_STRETCH) + 1e-9, _STRETCH_STEP))
     scores = stretched(placed, matches[0], interval, factors)
     levels = independent(matches[0].train.span) * len(usable) / 2
-    alone = float(np.mean([np.log(1 - s.score**2) for s in usable]))
+    alone = _alone(usable)
     factor = 1.0
     if levels * np.log((1 - matches[0].score ** 2) / (1 - scores.max() ** 2)) > -np.log(
         PRIOR_UNKNOWN
@@ -167,6 +167,23 @@ def _in_step(
     speed = matches[0].speed
     kept = [(s, shift / speed) for s, (_, shift) in zip(usable, placed, strict=True)]
     return Seen(matches, direction, kept)
+
+
+def _alone(usable: Sequence[Scanned]) -> float:
+    """ln of the part that the likeliest type leaves of the channels one by one, on average.
+
+    What a wrong clock explains is one train: a type that each channel shows best by itself is none.
+    """
+    left: dict[tuple[str, bool], list[float]] = {}
+    for s in usable:
+        best: dict[tuple[str, bool], float] = {}
+        for match in s.matches:
+            key = match.train.name, match.reverse
+            best[key] = max(best.get(key, 0.0), match.score)
+        for key, score in best.items():
+            left.setdefault(key, []).append(float(np.log(1 - score**2)))
+    common = [sum(logs) / len(logs) for logs in left.values() if len(logs) == len(usable)]
+    return min(common, default=0.0)
 
 
 def _one_by_one(usable: Sequence[Scanned]) -> Seen:
