@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, Estimate, TrainEvent, detect
-from trackvib_ros.detection.response_model import Model, Observation, Spectrum, comb
+from trackvib_ros.detection.events import Layer
+from trackvib_ros.detection.response_model import Model, Observation, Spectrum, comb, ringing
 from trackvib_ros.detection.unlisted import CAR, EqualCars
 from trackvib_ros.nuisances import RATE, nuisance
 
@@ -90,14 +91,19 @@ def _first(places: Array, v: float, a: float) -> float:
     return float(2 * places[0] / (v + np.sqrt(v**2 + 2 * a * places[0])))
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.3])
-def test_evidence_is_that_of_the_gaussian_model(deviation: float) -> None:
+@pytest.mark.parametrize("deviation", [(), (0.3, 0.1, 0.05, 0.2)])
+def test_evidence_is_that_of_the_gaussian_model(deviation: tuple[float, ...]) -> None:
     """Second method: the marginal likelihood by the dense covariance of all coefficients."""
     random = np.random.default_rng(3)
     values = random.standard_normal(400) * np.hanning(400)
     seen = Observation("x", 0.0, 0.01 * np.arange(400) - 2.0, values, np.zeros(0), 3.0, 50.0)
-    model = Model(Spectrum(seen, 1.0, 12.0), 0.2, 0.4, 0.2, 0.1, deviation)
+    misfit = 0.2, 0.1, 0.4, 0.02
+    model = Model(Spectrum(seen, 1.0, 12.0), 0.2, 0.4, misfit, 0.1, deviation)
     s = model.spectrum
+    # octaves down from 12 Hz; the last one is all that is slower
+    octave = np.digitize(s.f, [1.5, 3.0, 6.0])
+    part = np.array(misfit)[3 - octave]
+    size = np.sqrt(np.array(deviation or [0.0] * 4)[3 - octave])
     places = np.array([-9.0, -6.5, 6.5, 9.0])
     v, a = np.array([20.0]), np.array([0.0])
     combs = model.comb(places, v, a)
@@ -107,34 +113,38 @@ def test_evidence_is_that_of_the_gaussian_model(deviation: float) -> None:
     # the four wheelsets of a car: what each answers is the common response and its contrasts
     patterns = [[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]]
     parts = []
-    for size, pattern in zip([1.0, *[deviation**0.5] * 3], patterns, strict=True):
+    for share, pattern in zip([np.ones(s.f.size), size, size, size], patterns, strict=True):
         each = comb(places, s.f, v, a, np.array([pattern], dtype=float))[0, 0]
         knots = np.exp(-2j * np.pi * np.outer(s.f, t + 0.1))
-        parts.append((size * each * shape)[:, None] * knots)
+        parts.append((share * each * shape)[:, None] * knots)
     design = np.concatenate(parts, axis=1)
     # real and imaginary parts are independent; a share of the padded coefficients counts
     real = np.concatenate([design.real, design.imag])
-    rest = np.concatenate([s.noise + 0.2 * s.excess] * 2) / (2 * s.share)
+    rest = np.concatenate([s.noise + part * s.excess] * 2) / (2 * s.share)
     y = np.concatenate([s.y.real, s.y.imag])
     covariance = np.diag(rest) + real @ real.T
     quadratic = y @ np.linalg.solve(covariance, y)
     log = np.linalg.slogdet(covariance)[1] - np.sum(np.log(rest))
     own = s.noise + s.excess
     null = 2 * s.share * np.sum(np.abs(s.y) ** 2 / own)
-    levels = 2 * s.share * np.sum(np.log(own / (s.noise + 0.2 * s.excess)))
+    levels = 2 * s.share * np.sum(np.log(own / (s.noise + part * s.excess)))
     assert found == pytest.approx(0.5 * (null - quadratic - log + levels), rel=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("name", "speed", "acceleration"), [("CRH3", 70.0, 0.0), ("articulated", 38.0, -0.3)]
+    ("name", "speed", "acceleration", "layer"),
+    [("CRH3", 70.0, 0.0, "bridge"), ("articulated", 38.0, -0.3, "slab")],
 )
-def test_a_bridge_alone_gives_the_speed_of_a_known_type(
-    name: str, speed: float, acceleration: float
+def test_a_channel_alone_gives_the_speed_of_a_known_type(
+    name: str, speed: float, acceleration: float, layer: Layer
 ) -> None:
     times = wheelset_times(name, speed, acceleration)
     x = recorded(times, 500.0, ("modes", speed), 0.01, 1)
-    event = passage(detect(500.0, x, [Channel("bridge", 5.0, "bridge")], known(name)))
+    events = detect(500.0, x, [Channel("one", 5.0, layer)], known(name))
+    event = passage(events)
     assert event is not None
+    # none is told where none is seen
+    assert not [event for event in events if event.kind == "axle"]
     assert event.values["grade"] == CONFIRMED
     found = speed_of(event)
     # the waveform's model is exact, that of the energy is not where answers overlap; 2e-4 is 4 cm
@@ -142,19 +152,27 @@ def test_a_bridge_alone_gives_the_speed_of_a_known_type(
     assert found.value == pytest.approx(speed, rel=2e-4)
     bend = estimate(event, "acceleration")
     assert abs(bend.value - acceleration) < 4 * bend.sigma < 0.3
-    assert event.values["reference"] == "bridge"
+    assert event.values["reference"] == "one"
     assert event.values["direction"] == "unknown"
     assert "axles_not_visible" in event.quality
     spectral = estimate(event, "speed_spectrum")
     assert abs(spectral.value - speed) < 4 * spectral.sigma
 
 
-def test_no_wheelset_is_told_where_none_is_seen() -> None:
-    times = wheelset_times("CRH3", 55.0)
-    x = recorded(times, 500.0, ("modes", 55.0), 0.02, 2)
-    events = detect(500.0, x, [Channel("slab", 0.0, "slab")], known("CRH3"))
-    assert passage(events) is not None
-    assert not [event for event in events if event.kind == "axle"]
+def test_a_mode_that_rings_on_is_ended_by_its_filter() -> None:
+    """Closed form: free vibration is zero behind the filter, and a blow as short as it was."""
+    rate, f, damping = 400.0, 6.0, 0.02
+    t = np.arange(round(8 * rate)) / rate
+    pole = 2j * np.pi * f * np.sqrt(1 - damping**2) - 2 * np.pi * f * damping
+    x = np.zeros(t.size)
+    for blow in (0.5, 0.9, 1.7):
+        x += np.where(t > blow, np.imag(np.exp(pole * (t - blow).clip(0))), 0.0)
+    taps = np.array(ringing(t, x, 1.8))
+    root = np.exp(pole / rate)
+    # blocks of several samples shift no pole: rounding of a least-squares fit only
+    np.testing.assert_allclose(taps, [1.0, -2 * root.real, abs(root) ** 2], atol=1e-6)
+    left = np.convolve(x, taps)[: x.size]
+    assert np.sum(np.abs(left) > 1e-4 * np.abs(left).max()) <= 3 * 2
 
 
 @pytest.mark.parametrize(("name", "speed"), [("CRH3", 50.0), ("locomotive_hauled", 30.0)])
@@ -199,9 +217,9 @@ def test_two_bridge_channels_share_a_motion_but_no_direction() -> None:
 
 
 def test_stated_sigma_holds_the_error() -> None:
-    """White noise near the level of the signal, ten seeds: rms of error / sigma."""
+    """White noise near the level of the signal, six seeds: rms of error / sigma."""
     ratios = []
-    for seed in range(10):
+    for seed in range(6):
         times = wheelset_times("metro", 33.0)
         x = recorded(times, 400.0, ("modes", 33.0), 0.3, seed)
         event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], known("metro")))
@@ -210,8 +228,8 @@ def test_stated_sigma_holds_the_error() -> None:
         ratios.append((found.value - 33.0) / found.sigma)
     rms = float(np.sqrt(np.mean(np.square(ratios))))
     # sigma allows for misfit that is not white (CORRELATED = 3), which is absent here: 0.58
-    # expected, and chi-square of ten holds 0.33 to 0.83 in 95 %
-    assert 0.3 < rms < 1.0
+    # expected, and chi-square of six holds 0.26 to 0.90 in 95 %
+    assert 0.25 < rms < 1.0
 
 
 def test_an_unlisted_train_is_told_as_unknown() -> None:

@@ -11,7 +11,6 @@ from . import stated
 from .blind import CONFIDENT, Blind
 from .catalogue import Catalogue, TrainType
 from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent, Value
-from .evidence import half_interval
 from .health import clipped
 from .live import Partial
 from .passage import CONFIRM_SCORE, KNOWN_SCORE, Hypothesis, Passage
@@ -362,21 +361,15 @@ def response(
     """
     best, motion = passage.best, passage.motion
     train = best.train
-    parts = passage.speeds
-    own = motion.speed_sigma(motion.epoch)
-    half = max(half_interval(parts, best.speed), 1.96 * own)
-    sigma = half / 1.96
+    speed, sigma, half = passage.speed
+    size = speed / best.speed  # lengths scale alike
     first, last = (float(motion.time_at(place)) for place in (0.0, train.span))
     # the passing time is known better than speed and length, which scale alike
     edge = float(np.hypot(passage.middle[1], 0.5 * train.span / best.speed * passage.relative))
-    named = sum(
-        p for p, f in zip(passage.probabilities, passage.fits, strict=True) if f.train is train
-    )
-    grouped: dict[str, float] = {}
     listed: dict[str, float] = {}
     for p, fit in zip(passage.probabilities, passage.fits, strict=True):
-        grouped[fit.train.family] = grouped.get(fit.train.family, 0.0) + p
-        listed[fit.train.name] = listed.get(fit.train.name, 0.0) + p
+        listed[fit.train.name] = listed.get(fit.train.name, 0.0) + p * (1 - passage.unknown)
+    bend = float(np.hypot(motion.acceleration_sigma, sigma / speed * motion.acceleration))
     names = tuple(channel.name for channel in passage.channels)
     quality = ["axles_not_visible", "speed_scales_with_type"]
     if not passage.known:
@@ -395,22 +388,19 @@ def response(
 
     values: dict[str, Value] = {
         "unknown_probability": round(passage.unknown, 4),
-        "train_length": Estimate(train.length, train.length * sigma / best.speed, "m"),
+        "train_length": Estimate(size * train.length, train.length * sigma / best.speed, "m"),
         "evidence": round(best.evidence, 1),
+        "types": ranked(listed),
+        "families": ranked(passage.families),
     }
-    acceleration = motion.acceleration, motion.acceleration_sigma
     if passage.known:
         values |= _identity(train, best.reverse) | {
             "axle_count": train.axles.size,
             "axle_count_of": "the type",
-            "type_probability": round(named, 4),
-            "types": ranked(listed),
-            "families": ranked(grouped),
+            "type_probability": round(listed[train.name], 4),
             "speed_passing_time": Estimate(*passage.by_duration, "m/s"),
         }
-    else:
-        bend = float(np.hypot(motion.acceleration_sigma, CAR[1] * motion.acceleration))
-        acceleration = motion.acceleration, bend
+    elif not passage.listed:
         cars = best.speed / CAR[0]
         values["car_rate"] = Estimate(cars, cars * passage.relative, "Hz")
     if passage.spectral is not None:
@@ -421,9 +411,9 @@ def response(
         arrival=(first, edge),
         departure=(last, edge),
         passing_sigma=(last - first) * passage.relative,
-        speed=(best.speed, sigma),
-        interval=(best.speed - half, best.speed + half),
-        acceleration=acceleration,
+        speed=(speed, sigma),
+        interval=(speed - half, speed + half),
+        acceleration=(size * motion.acceleration, bend),
         direction=passage.direction,
         method="one common response per wheelset, least squares",
         confidence=float(np.clip(1 - CONFIRM_EVIDENCE / (2 * best.evidence), 0.0, 0.99)),

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from .catalogue import TrainType
 from .events import Channel
-from .evidence import PRIOR_UNKNOWN
+from .evidence import PRIOR_UNKNOWN, half_interval
 from .kinematics import Motion
 from .record import Record
 from .response_model import (
@@ -43,7 +43,7 @@ from .response_search import (
     Search,
     distinct,
 )
-from .unlisted import ALTERNATIVES, CAR, CHOICES, FAMILY, NUMBERS_APART
+from .unlisted import ALTERNATIVES, CAR, CHOICES, NUMBERS_APART
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -62,6 +62,10 @@ had a train of somewhat other proportions more than a fifth better than itself),
 that may differ within a car (of 16 passages of equal cars all but one within 6 %, 2 % on average).
 """
 
+HELD = 0.95
+"""Probability that the family of a named type, and the interval of a speed, hold."""
+
+_TWO_SIDED = 1.96  # sigmas of a Gaussian that hold as much
 _PLACED = 0.45
 _SHORTEST_S = 0.3
 
@@ -88,7 +92,8 @@ class ResponsePassage:
         duration: between 5 and 95 % of the energy (s).
         spectral: speed by the bogie-passing spectrum (m/s), sigma; or None.
         unlisted: the train of equal cars that explains most, at the speed of cars of 20 m.
-        choice: ln of the mean over all proportions of what they explain, over the best ones'.
+        choice: ln of the mean over all proportions, the usual ones most, of what they explain, over
+            the best ones'.
         types: number of types to choose from.
     """
 
@@ -126,16 +131,33 @@ class ResponsePassage:
         return float(odds / (1 + odds))
 
     @property
-    def known(self) -> bool:
+    def listed(self) -> bool:
         """Whether a type of the catalogue explains the train as well as any other would."""
         if self.unknown >= 0.5:
             return False
         return self.unlisted is None or self._train(self.fits[0]) or not self._train(self.unlisted)
 
     @property
+    def families(self) -> dict[str, float]:
+        """Probability of every family, most probable first."""
+        found: dict[str, float] = {}
+        for p, fit in zip(self.probabilities, self.fits, strict=True):
+            found[fit.train.family] = found.get(fit.train.family, 0.0) + (1 - self.unknown) * p
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def known(self) -> bool:
+        """Whether a type is named: its family holds, and no other train is left.
+
+        Trains of like proportions differ by less than wheelsets do within a car, so that the most
+        probable one of several is often wrong. Where only one type may be it, nothing is chosen.
+        """
+        return self.listed and (self.types == 1 or max(self.families.values()) >= HELD)
+
+    @property
     def best(self) -> ResponseFit:
-        """The most probable fit; of the train of equal cars if the type is not known."""
-        return self.fits[0] if self.known or self.unlisted is None else self.unlisted
+        """The most probable fit; of the train of equal cars if no type of the catalogue is."""
+        return self.fits[0] if self.listed or self.unlisted is None else self.unlisted
 
     @property
     def confirmed(self) -> bool:
@@ -150,7 +172,7 @@ class ResponsePassage:
         common = fit.common or fit
         chosen = CORRELATED * float(np.log(CHOICES)) if fit is self.unlisted else 0.0
         evidence = common.evidence - chosen
-        explained = min(model.misfit for model in common.models) <= USUAL_MISFIT
+        explained = min(model.unexplained for model in common.models) <= USUAL_MISFIT
         explained |= evidence > CERTAIN_EVIDENCE
         clear = evidence > CONFIRM_EVIDENCE and common.covariance is not None
         return clear and explained and common.alike
@@ -163,7 +185,7 @@ class ResponsePassage:
         if best.covariance is not None:
             covariance[1:, 1:] = CORRELATED * best.covariance
         covariance[0, 0] = (self.middle[1] * best.speed) ** 2
-        if not self.known:
+        if not self.listed:
             covariance[1, 1] += (CAR[1] * best.speed) ** 2
         half = 0.5 * best.train.span
         return Motion(self.middle[0], half, best.speed, best.acceleration, covariance)
@@ -174,7 +196,7 @@ class ResponsePassage:
         best = self.best
         own = CORRELATED * best.covariance[0, 0] if best.covariance is not None else 0.0
         variance = float(own) / best.speed**2
-        if self.known:
+        if self.listed:
             rate = best.speed / best.train.span
             pairs = zip(self.probabilities, self.fits, strict=True)
             variance += sum(p * (f.speed / f.train.span / rate - 1) ** 2 for p, f in pairs)
@@ -187,8 +209,12 @@ class ResponsePassage:
         return speed, PASSED_SPREAD * speed
 
     @property
-    def speeds(self) -> list[tuple[float, float, float]]:
-        """(probability, speed, sigma) of every fit, and of an unlisted train (m/s)."""
+    def speed(self) -> tuple[float, float, float]:
+        """Speed of the middle of the train, sigma, half the interval that holds it (m/s).
+
+        The mean of the trains that together hold 95 %: while types are ambiguous, the speed of one
+        of them is wrong by all they differ by whenever another one is right.
+        """
         listed = 1 - self.unknown
         parts = [
             (listed * p, fit.speed, float(np.sqrt(CORRELATED * fit.covariance[0, 0])))
@@ -197,7 +223,17 @@ class ResponsePassage:
         ]
         if self.unlisted is not None:
             parts.append((self.unknown, self.unlisted.speed, CAR[1] * self.unlisted.speed))
-        return parts
+        own = self.motion.speed_sigma(self.middle[0])
+        if not parts:
+            return self.best.speed, own, _TWO_SIDED * own
+        parts.sort(reverse=True)
+        before = np.cumsum([p for p, _, _ in parts])
+        held = parts[: 1 + int(np.searchsorted(before, HELD * before[-1]))]
+        weight, value, sigma = (np.array(column) for column in zip(*held, strict=True))
+        mean = float(weight @ value / weight.sum())
+        spread = float(np.sqrt(weight @ ((value - mean) ** 2 + sigma**2) / weight.sum()))
+        half = max(half_interval(parts, mean, HELD), _TWO_SIDED * own)
+        return mean, max(spread, half / _TWO_SIDED), half
 
 
 def _placed(fit: ResponseFit, k: int) -> tuple[float, float]:
@@ -232,7 +268,8 @@ def _spectral(fit: ResponseFit, k: int) -> tuple[float, float] | None:
     power = np.abs(s.y[low]) ** 2
     bend = np.full(v.size, fit.acceleration)
     lines = np.abs(comb(fit.places, s.f[low], v, bend)) ** 2 / fit.places.size
-    mean = s.noise[low] + s.excess[low] * (model.misfit + lines) / (1 + model.misfit)
+    misfit = model.unexplained
+    mean = s.noise[low] + s.excess[low] * (misfit + lines) / (1 + misfit)
     score = -s.share * np.sum(np.log(mean) + power / mean, axis=1)
     i = int(np.argmax(score))
     if not 0 < i < v.size - 1:
@@ -284,20 +321,22 @@ def find_response(
     coarse = search.scan(oriented)
     listed = search.refined(coarse) if any(fit.evidence > 0 for fit in coarse) else []
     equal = search.unlisted()
-    leaders = [*listed[:2], *([equal[0]] if equal else [])]
-    listed += search.transferred(oriented, leaders)
-    together = search.shared([*listed, *([equal[0]] if equal else [])])
+    others = [equal] if equal is not None else []
+    listed += search.transferred(oriented, [*listed[:2], *others])
+    together = search.shared([*listed, *others])
     if not together or together[0].evidence < 0:
         return None
     if together[0].evidence > CONFIRM_EVIDENCE:  # else no train is told
         together = search.varied(together)
-    fits = [fit for fit in together if fit.train.family != FAMILY]
-    other = next((fit for fit in together if fit.train.family == FAMILY), None)
+    fits = [fit for fit in together if fit.cars is None]
+    other = next((fit for fit in together if fit.cars is not None), None)
     choice = 0.0
-    if other is not None and equal is not None and other.common is not None:
-        other, values = search.proportions(other, equal[1])
+    if other is not None and other.cars is not None and other.common is not None:
+        near = other.cars.proportions()
+        other, values = search.proportions(other, near)
         gains = (values - values.max()) / tempered(float(values.max()))
-        choice = float(np.log(np.mean(np.exp(gains))))
+        usual = np.array([cars.prior for cars in near])
+        choice = float(np.log(usual @ np.exp(gains) / usual.sum()))
     top = fits[0].evidence if fits else 0.0
     unit = tempered(top)
     likely = [fit for fit in distinct(fits) if fit.evidence > top - KEPT * unit / CORRELATED]
@@ -319,8 +358,8 @@ def find_response(
     return replace(
         told,
         middle=placed[0],
-        direction=_direction(channels, placed, told.best.speed) if told.known else 0,
-        spectral=_spectral(told.best, used[0][1]) if told.known else None,
+        direction=_direction(channels, placed, told.best.speed) if told.listed else 0,
+        spectral=_spectral(told.best, used[0][1]) if told.listed else None,
     )
 
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.linalg import lapack
 
 from .features import SLOW
 from .record import Record
@@ -21,10 +23,18 @@ ComplexArray = NDArray[np.complex128]
 USUAL_MISFIT = 0.25
 """Part of the spectrum that no response explains, where it is not fitted."""
 
+OCTAVES = 4
+"""Down from the shortest waves, each with a misfit of its own; the last is all that is longer."""
+
 _MARGIN_S = 1.5  # on either side of the strong energy
 _FADE_S = 0.3
 _SLOWEST = 4.0  # periods in the strong interval: what is slower is its envelope
 _SMOOTH_HZ = 2.0
+_DAMPED = 0.1  # of critical: what is damped more does not outlast its wheelset by long
+_MODES = 2
+_RINGING = 0.2  # share of the free vibration, of a mode that is told apart from others
+_RINGING_HZ = 40.0
+_RUNG_S = 2.0
 _TOP_HZ = 80.0  # the waveform is low-passed at 100 Hz
 
 
@@ -44,6 +54,7 @@ class Observation:
         quiet: samples before the event.
         duration: between 5 and 95 % of the energy (s).
         limit: highest frequency it holds (Hz).
+        filtered: coefficients by which ``values``, but not ``quiet``, were filtered.
     """
 
     name: str
@@ -53,6 +64,7 @@ class Observation:
     quiet: Array
     duration: float
     limit: float
+    filtered: tuple[float, ...] = (1.0,)
 
 
 class Spectrum:
@@ -72,13 +84,19 @@ class Spectrum:
         self.y: ComplexArray = fft.rfft(seen.values, size)[wanted] * np.exp(
             -2j * np.pi * self.f * seen.time[0]
         )
+        octave = np.floor(np.log2(min(top, seen.limit) / np.maximum(self.f, 1e-9)))
+        self.octave = np.clip(octave, 0, OCTAVES - 1).astype(int)
         self.share = n / size  # of the coefficients that are independent
+        delays = np.arange(len(seen.filtered)) * step
+        phases = np.exp(-2j * np.pi * np.outer(self.f, delays))
+        self.gain = np.abs(phases @ np.array(seen.filtered)) ** 2
         quiet = seen.quiet
         self.noise = np.zeros(self.f.size)
         if quiet.size > 64:
             own = np.abs(fft.rfft(quiet)) ** 2 * (n / quiet.size)
             own = smoothed(own, max(3, round(_SMOOTH_HZ * quiet.size * step)))
             self.noise = np.interp(self.f, fft.rfftfreq(quiet.size, step), own)
+            self.noise *= self.gain
         self.excess = np.zeros(self.f.size)
         if self.usable:
             power = np.abs(self.y) ** 2
@@ -143,17 +161,18 @@ class Model:
 
     Attributes:
         before, after: support of the response about the passing of its wheelset (s).
+        misfit: part of the spectrum that no response explains, of every octave.
         centre: of that passing for the middle of the train, after the epoch (s).
         deviation: power, over that of the common response, of what the wheelsets of a car differ
-            by (:func:`signs`).
+            by (:func:`signs`), of every octave; none if they answer alike.
     """
 
     spectrum: Spectrum
     before: float
     after: float
-    misfit: float = USUAL_MISFIT
+    misfit: tuple[float, ...] = (USUAL_MISFIT,) * OCTAVES
     centre: float = 0.0
-    deviation: float = 0.0
+    deviation: tuple[float, ...] = ()
 
     def comb(self, places: Array, speed: Array, acceleration: Array) -> ComplexArray:
         """:func:`comb` with all that the model needs."""
@@ -166,11 +185,24 @@ class Model:
         step = 1 / (2.3 * self.spectrum.f[-1])
         return np.arange(-self.before, self.after + step, step)
 
+    @property
+    def unexplained(self) -> float:
+        """Part of what was recorded that no response explains."""
+        s = self.spectrum
+        power = s.excess / s.gain
+        return float(np.array(self.misfit)[s.octave] @ power / power.sum())
+
     def _variance(self) -> Array:
-        return self.spectrum.noise + self.misfit * self.spectrum.excess
+        s = self.spectrum
+        return np.asarray(s.noise + np.array(self.misfit)[s.octave] * s.excess)
 
     def _shape(self, wheelsets: int, knots: int) -> Array:
         return np.sqrt(self.spectrum.excess / (wheelsets * knots))
+
+    @cached_property
+    def _waves(self) -> ComplexArray:
+        t = self.knots
+        return np.asarray(np.exp(2j * np.pi * np.outer(self.spectrum.f, t - t[0])))
 
     def _normal(self, combs: ComplexArray, wheelsets: int, centres: Array) -> tuple[Array, Array]:
         s, t = self.spectrum, self.knots
@@ -178,21 +210,26 @@ class Model:
         motions, patterns = combs.shape[:2]
         shape = self._shape(wheelsets, t.size)
         weight = 2 * s.share / self._variance()
-        size = np.ones(patterns)
-        size[1:] = np.sqrt(self.deviation)
-        angle = 2 * np.pi * np.outer(s.f, t - t[0])
-        lag = np.subtract.outer(np.arange(t.size), np.arange(t.size))
-        order = np.abs(lag)
-        scaled = combs * size[:, None]
-        cross = np.conj(scaled)[:, :, None] * scaled[:, None] * (weight * shape**2)
-        normal = (cross.real @ np.cos(angle))[..., order]
+        size = np.ones((patterns, s.f.size))
         if patterns > 1:
-            normal -= (cross.imag @ np.sin(angle))[..., order] * np.sign(lag)
-        normal = normal.swapaxes(2, 3).reshape(motions, patterns * t.size, -1)
-        knots = np.exp(2j * np.pi * np.outer(s.f, t))
-        phase = knots[:, :, None] * np.exp(2j * np.pi * np.outer(s.f, centres))[:, None, :]
-        right = np.real((np.conj(scaled) * (weight * shape * s.y)) @ phase.reshape(s.f.size, -1))
-        return normal + np.eye(len(normal[0])), right.reshape(motions, -1, centres.size)
+            size[1:] = np.sqrt(np.array(self.deviation)[s.octave])
+        scaled = combs * size
+        blocks = np.empty((motions, patterns, t.size, patterns, t.size))
+        for i in range(patterns):
+            for j in range(i, patterns):
+                cross = np.conj(scaled[:, i]) * scaled[:, j] * (weight * shape**2)
+                even, odd = cross.real @ self._waves.real, cross.imag @ self._waves.imag
+                # of lags from the longest positive to the longest negative one: Toeplitz
+                lags = np.concatenate([(even - odd)[:, ::-1], (even + odd)[:, 1:]], axis=1)
+                block = np.lib.stride_tricks.sliding_window_view(lags, t.size, axis=1)[:, ::-1]
+                blocks[:, i, :, j] = block
+                blocks[:, j, :, i] = block.swapaxes(1, 2)
+        normal: Array = blocks.reshape(motions, patterns * t.size, patterns * t.size)
+        normal[:, range(patterns * t.size), range(patterns * t.size)] += 1.0
+        start = np.exp(2j * np.pi * np.outer(centres + t[0], s.f))
+        seen = np.conj(scaled)[:, :, None] * (weight * shape * s.y * start)
+        right = np.real(seen @ self._waves).swapaxes(2, 3)
+        return normal, right.reshape(motions, -1, centres.size)
 
     def evidence(self, combs: ComplexArray, wheelsets: int, centres: Array) -> Array:
         """ln of the marginal likelihood over that of a disturbance with the same spectrum.
@@ -210,8 +247,11 @@ class Model:
         s = self.spectrum
         normal, right = self._normal(combs, wheelsets, centres)
         factor = np.linalg.cholesky(normal)
-        part = np.linalg.solve(factor, right)
-        explained = np.sum(part * part, axis=1)
+        parts = [
+            lapack.dtrtrs(low.T, each, lower=0, trans=1)[0]
+            for low, each in zip(factor, right, strict=True)
+        ]
+        explained = np.array([np.sum(part * part, axis=0) for part in parts])
         cost = 2 * np.sum(np.log(np.diagonal(factor, axis1=1, axis2=2)), axis=1)
         own, rest = s.noise + s.excess, self._variance()
         power = np.abs(s.y) ** 2
@@ -263,6 +303,43 @@ def strong_extent(record: Record, within: tuple[float, float]) -> tuple[float, f
     return min(found)[1:] if found else None
 
 
+def ringing(time: Array, values: Array, since: float) -> tuple[float, ...]:
+    """Coefficients of the filter that ends the free vibration of the strongest modes.
+
+    A mode rings on for seconds after a wheelset, far longer than a response can be that shall tell
+    wheelsets apart. ``x(k) - 2 rho cos(theta) x(k-1) + rho² x(k-2)`` is zero while it rings freely
+    and local while it is driven: what is left of the response is as short as the driving force.
+    The poles are those of the free vibration after the train (ESPRIT: Roy & Kailath, IEEE Trans.
+    Acoust. Speech Signal Process. 37, 1989, 984-995).
+
+    Args:
+        time, values: of the series (s), equal steps.
+        since: end of the strong energy (s).
+    """
+    step = float(time[1] - time[0])
+    width = max(1, int(1 / (4 * _RINGING_HZ * step)))
+    free = values[time > since + _FADE_S]
+    count = min(free.size // width, round(_RUNG_S / (width * step)))
+    if count * width * step < 1.0:
+        return (1.0,)
+    free = free[: count * width].reshape(count, width).mean(axis=1)
+    free = free - free.mean()
+    lagged = np.lib.stride_tricks.sliding_window_view(free, count // 3)
+    space = np.linalg.eigh(lagged.T @ lagged)[1][:, -2 * _MODES :]
+    roots = np.linalg.eigvals(np.linalg.lstsq(space[:-1], space[1:], rcond=None)[0])
+    poles = np.log(roots[roots.imag > 0]) / (width * step)
+    kept = (poles.real < 0) & (-poles.real < _DAMPED * np.abs(poles))
+    poles = poles[kept & (poles.imag < 2 * np.pi * _RINGING_HZ)]
+    decays = np.exp(np.outer(np.arange(count) * width * step, np.r_[poles, poles.conj()]))
+    size = np.abs(np.linalg.lstsq(decays, free.astype(complex), rcond=None)[0]) ** 2
+    share = 2 * size * np.sum(np.abs(decays) ** 2, axis=0) / max(float(free @ free), 1e-300)
+    taps = np.ones(1)
+    for pole in poles[share[: poles.size] > _RINGING]:
+        root = np.exp(pole * step)
+        taps = np.convolve(taps, [1.0, -2 * root.real, abs(root) ** 2])
+    return tuple(float(tap) for tap in taps)
+
+
 def observations(
     record: Record, within: tuple[float, float], extent: tuple[float, float]
 ) -> list[Observation]:
@@ -280,14 +357,15 @@ def observations(
         if not window.valid.all() and window.valid.any():
             values = np.interp(time, time[window.valid], raw[window.valid])
         near = (time > extent[0] - _MARGIN_S) & (time < extent[1] + _MARGIN_S)
-        values, time = values.copy(), time - epoch
         quiet = values[window.time < within[0]]
+        taps = ringing(time, values, extent[1]) if name == "waveform" else (1.0,)
+        time = time - epoch
         part = values[near]
         ends = max(4, round(0.1 / step))
         if part.size < 8 * ends:
             continue
         first, last = np.median(part[:ends]), np.median(part[-ends:])
-        part = part - np.linspace(first, last, part.size)
+        part = np.convolve(part - np.linspace(first, last, part.size), taps)[: part.size]
         fade = min(round(_FADE_S / step), part.size // 8)
         ramp = 0.5 - 0.5 * np.cos(np.pi * (np.arange(fade) + 0.5) / fade)
         part[:fade] *= ramp
@@ -295,5 +373,6 @@ def observations(
         grid = time[near][0] + step * np.arange(part.size)
         quiet = quiet - quiet.mean() if quiet.size else quiet
         duration = extent[1] - extent[0]
-        out.append(Observation(name, epoch, grid, part, quiet, duration, min(limit, 0.4 / step)))
+        top = min(limit, 0.4 / step)
+        out.append(Observation(name, epoch, grid, part, quiet, duration, top, taps))
     return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 from .catalogue import TrainType
 from .kinematics import PRIOR_ACCELERATION
 from .response_model import (
+    OCTAVES,
     Model,
     Observation,
     Spectrum,
 )
-from .unlisted import CAR, FAMILY, EqualCars, starts
+from .unlisted import CAR, EqualCars, starts
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -34,8 +36,8 @@ relative spread."""
 KEPT = 15.0
 """Evidence below the best at which a hypothesis is dropped."""
 
-_MISFITS = 0.5, 0.25, 0.12, 0.06, 0.03, 0.015  # parts of the spectrum that no response explains
-_DEVIATIONS = 0.03, 0.1, 0.3  # power of what wheelsets of a car differ by, over the common
+_MOST_MISFIT, _LEAST_MISFIT = 0.5, 0.001  # part of the spectrum that no response explains
+_DEVIATIONS = 0.1, 0.3, 1.0  # power of what wheelsets of a car differ by, over the misfit
 _REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
 _MIDDLE, _FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
@@ -62,6 +64,7 @@ class ResponseFit:
         motion: its distance is that of the first wheelset past the reference channel.
         evidence: ln of the marginal likelihood over that of a disturbance.
         common: the fit with one response for all wheelsets, if they may differ here.
+        cars: what the train is made of, if it is none of the catalogue.
     """
 
     train: TrainType
@@ -72,6 +75,11 @@ class ResponseFit:
     models: tuple[Model, ...] = ()
     covariance: Array | None = None
     common: ResponseFit | None = None
+    cars: EqualCars | None = None
+
+    def of(self, cars: EqualCars) -> ResponseFit:
+        """The fit with another train of equal cars."""
+        return replace(self, train=cars.train, cars=cars)
 
     @property
     def places(self) -> Array:
@@ -235,14 +243,14 @@ class Search:
                     spectrum = Spectrum(seen, 2 * r / reference + ring, reference / wave)
                     if not spectrum.usable:
                         continue
-                    model = Model(spectrum, r / reference, r / reference + ring, old.misfit)
+                    # one octave more than before
+                    misfit = (old.misfit[0], *old.misfit[:-1])
+                    model = Model(spectrum, r / reference, r / reference + ring, misfit)
                     free = max(reach - r, 0.0) / reference
                     centres = old.centre + np.linspace(-free, free, 5 if free else 1)
-                    combs = self._own(k, model, fit)
-                    values = model.evidence(combs, fit.places.size, centres)[0]
-                    i = int(np.argmax(values))
-                    if best is None or values[i] > best[0]:
-                        best = float(values[i]), replace(model, centre=float(centres[i]))
+                    value, placed = self._placed(k, model, fit, centres)
+                    if best is None or value > best[0]:
+                        best = value, placed
             # too few coefficients on finer waves: the coarser ones stay
             models.append(old if best is None else best[1])
         return self.weighted(replace(fit, models=tuple(models)))
@@ -263,14 +271,33 @@ class Search:
         )
 
     def weighted(self, fit: ResponseFit) -> ResponseFit:
-        """The fit with the misfits of most evidence."""
+        """The fit with the misfits of most evidence, of one octave after the other."""
         models = []
         for k, model in enumerate(fit.models):
-            combs, centre = self._own(k, model, fit), np.array([model.centre])
-            trials = [replace(model, misfit=misfit) for misfit in _MISFITS]
-            values = [m.evidence(combs, fit.places.size, centre)[0, 0] for m in trials]
-            models.append(trials[int(np.argmax(values))])
+            combs, here = self._own(k, model, fit), np.array([model.centre])
+            best, top = model, float(model.evidence(combs, fit.places.size, here)[0, 0])
+            for octave, factor in itertools.product(range(OCTAVES), (0.5, 2.0)):
+                while True:
+                    misfit = list(best.misfit)
+                    misfit[octave] *= factor
+                    if not _LEAST_MISFIT <= misfit[octave] <= _MOST_MISFIT:
+                        break
+                    trial = replace(best, misfit=tuple(misfit))
+                    value = float(trial.evidence(combs, fit.places.size, here)[0, 0])
+                    if value <= top:
+                        break
+                    best, top = trial, value
+            models.append(best)
         return replace(fit, models=tuple(models))
+
+    def shared(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        """Every fit with the models of whichever fit suit it best, most probable first.
+
+        What one of two like trains has found of a response, the other one must be allowed, too:
+        types must not be told apart by how well a search went.
+        """
+        trials = [[fit.models[k] for fit in fits] for k in range(len(self.seen))]
+        return self._sorted([self._suited(fit, trials, fits) for fit in fits])
 
     def varied(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """The likely ones of shared fits with wheelsets that may differ within a car.
@@ -280,80 +307,66 @@ class Search:
         """
         leaders: dict[bool, ResponseFit] = {}
         for fit in fits:
-            leaders.setdefault(fit.train.family == FAMILY, fit)
+            leaders.setdefault(fit.cars is None, fit)
         least = (1 - _BLUR) * fits[0].evidence - KEPT
         near = [*leaders.values()]
-        near += [f for f in fits if f.evidence > least and all(f is not n for n in near)][
-            : _VARIED - len(near)
-        ]
+        rest = [f for f in fits if f.evidence > least and all(f is not n for n in near)]
+        near += rest[: _VARIED - len(near)]
         models = [self._deviating(fit) for fit in leaders.values()]
-        out = []
-        for fit in near:
-            own = []
-            for k in range(len(self.seen)):
-                centres = np.unique(np.round([f.models[k].centre for f in near], 4))
-                best = -np.inf, fit.models[k]
-                for each in models:
-                    values = each[k].evidence(self._own(k, each[k], fit), fit.places.size, centres)[
-                        0
-                    ]
-                    i = int(np.argmax(values))
-                    if values[i] > best[0]:
-                        best = float(values[i]), replace(each[k], centre=float(centres[i]))
-                own.append(best[1])
-            free = replace(fit, models=tuple(own), common=fit)
-            moved = self.climb(free, _FINE, 2)
-            told = self.beside(moved, _FINE)
-            covariance = fit.covariance if told.covariance is None else told.covariance
-            out.append(replace(moved, covariance=covariance))
-        return sorted(out, key=lambda fit: -fit.evidence)
+        trials = [[each[k] for each in models] for k in range(len(self.seen))]
+        return self._sorted([replace(self._suited(fit, trials, near), common=fit) for fit in near])
 
     def _deviating(self, fit: ResponseFit) -> list[Model]:
-        """Its models with the deviations and misfits of most evidence."""
-        out = []
-        for k, model in enumerate(fit.models):
-            smaller = [m for m in _MISFITS if m <= model.misfit][:3]
-            trials = [
-                replace(model, deviation=deviation, misfit=misfit)
-                for deviation in _DEVIATIONS
-                for misfit in smaller
-            ]
-            out.append(max(trials, key=lambda trial: self._value(k, trial, fit)))
-        return out
+        """Its models with the deviations and misfits of most evidence.
 
-    def _value(self, k: int, model: Model, fit: ResponseFit) -> float:
-        combs = self._own(k, model, fit)
-        return float(model.evidence(combs, fit.places.size, np.array([model.centre]))[0, 0])
-
-    def shared(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
-        """Every fit with the models of whichever fit suit it best, most probable first.
-
-        What one of two like trains has found of a response, the other one must be allowed, too:
-        types must not be told apart by how well a search went.
+        Wheelsets may differ by what the common response leaves over, and most where that is most.
         """
         out = []
-        for fit in fits:
-            models = []
-            for k, own in enumerate(fit.models):
-                trials = {
-                    (m.before, m.after, m.misfit, m.deviation): m
-                    for m in (f.models[k] for f in fits)
-                }
-                starts = [own.centre, *(m.centre for m in trials.values())]
-                centres = np.unique(np.round(starts, 4))
-                best = -np.inf, own
-                for trial in trials.values():
-                    values = trial.evidence(self._own(k, trial, fit), fit.places.size, centres)[0]
-                    i = int(np.argmax(values))
-                    if values[i] > best[0]:
-                        best = float(values[i]), replace(trial, centre=float(centres[i]))
-                models.append(best[1])
-            moved = self.climb(replace(fit, models=tuple(models)), _FINE, 2)
-            told = self.beside(moved, _FINE)
-            out.append(
-                moved if told.covariance is None else replace(moved, covariance=told.covariance)
-            )
-        return sorted(out, key=lambda fit: -fit.evidence)
+        for k, model in enumerate(fit.models):
+            here = np.array([model.centre])
+            trials = [
+                replace(
+                    model,
+                    deviation=tuple(deviation * m for m in model.misfit),
+                    misfit=tuple(part * m for m in model.misfit),
+                )
+                for deviation in _DEVIATIONS
+                for part in (1.0, 0.5, 0.25)
+            ]
+            placed = [self._placed(k, trial, fit, here) for trial in trials]
+            out.append(max(placed, key=lambda pair: pair[0])[1])
+        return out
+
+    def _suited(
+        self, fit: ResponseFit, trials: Sequence[Sequence[Model]], fits: Sequence[ResponseFit]
+    ) -> ResponseFit:
+        """The fit with the models, of those of every observation, and the centres, of the fits,
+        that suit it best."""
+        models = []
+        for k, each in enumerate(trials):
+            centres = np.unique(np.round([f.models[k].centre for f in fits], 4))
+            distinct = {(m.before, m.after, m.misfit, m.deviation): m for m in each}
+            placed = [self._placed(k, model, fit, centres) for model in distinct.values()]
+            models.append(max(placed, key=lambda pair: pair[0])[1])
+        return self._settled(replace(fit, models=tuple(models)), _FINE)
+
+    def _placed(
+        self, k: int, model: Model, fit: ResponseFit, centres: Array
+    ) -> tuple[float, Model]:
+        """Evidence of a model for observation ``k`` at the best of its centres."""
+        values = model.evidence(self._own(k, model, fit), fit.places.size, centres)[0]
+        i = int(np.argmax(values))
+        return float(values[i]), replace(model, centre=float(centres[i]))
+
+    def _settled(self, fit: ResponseFit, wave: float) -> ResponseFit:
+        """The top near a fit, its variance that of the maxima beside it."""
+        moved = self.climb(fit, wave, 2)
+        told = self.beside(moved, wave)
+        return replace(moved, covariance=told.covariance)
+
+    @staticmethod
+    def _sorted(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+        return sorted(fits, key=lambda fit: -fit.evidence)
 
     def transferred(
         self, oriented: Sequence[tuple[TrainType, bool]], fits: Sequence[ResponseFit]
@@ -368,7 +381,7 @@ class Search:
                 v, a = ratio * fit.speed * near, np.full(near.size, ratio * fit.acceleration)
                 if not self.limits[0] <= ratio * fit.speed <= self.limits[1]:
                     continue
-                trial = replace(fit, train=train, reverse=reverse)
+                trial = replace(fit, train=train, reverse=reverse, cars=None)
                 values = self.total(trial, v, a)
                 i = int(np.argmax(values))
                 if best is None or values[i] > best.evidence:
@@ -379,7 +392,7 @@ class Search:
         found.sort(key=lambda fit: -fit.evidence)
         return found[:_PEAKS]
 
-    def unlisted(self) -> tuple[ResponseFit, EqualCars] | None:
+    def unlisted(self) -> ResponseFit | None:
         """The train of equal cars that explains most; its speed is that of cars of 20 m."""
         sizes = [limit * CAR[0] / length for limit, length in zip(self.limits, _CARS, strict=True)]
         search = Search(self.seen, (sizes[0], sizes[1]))
@@ -394,20 +407,20 @@ class Search:
         for trials in (EqualCars.numbers, EqualCars.proportions, EqualCars.numbers):
             v = fit.speed * (1 + 0.06 * _FINE / fit.train.span * np.arange(-2.0, 3.0, 2.0))
             a = np.full(v.size, fit.acceleration)
-            values = []
-            for trial in trials(cars):
-                values.append(float(search.total(replace(fit, train=trial.train), v, a).max()))
+            values = [float(search.total(fit.of(trial), v, a).max()) for trial in trials(cars)]
             cars = trials(cars)[int(np.argmax(values))]
-            fit = replace(fit, train=cars.train)
-        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2), cars
+            fit = fit.of(cars)
+        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2)
 
-    def proportions(self, fit: ResponseFit, cars: EqualCars) -> tuple[ResponseFit, Array]:
-        """The best proportions of equal cars whose wheelsets may differ, and the evidence of all.
+    def proportions(
+        self, fit: ResponseFit, trials: Sequence[EqualCars]
+    ) -> tuple[ResponseFit, Array]:
+        """The best of some trains of equal cars, and the evidence of all of them.
 
         At the passing time of the fit.
         """
         v, a = np.array([fit.speed]), np.array([fit.acceleration])
-        near = [replace(fit, train=trial.train) for trial in cars.proportions()]
+        near = [fit.of(trial) for trial in trials]
         values = np.array([float(self.total(each, v, a)[0]) for each in near])
         best = near[int(np.argmax(values))]
         return replace(best, evidence=float(values.max())), values
@@ -428,12 +441,8 @@ class Search:
             fits = []
             for fit in near[:_MOST]:
                 moved = self.beside(self.adapted(fit, wave, best.speed), wave)
-                moved = self.climb(self.weighted(self.climb(moved, wave, 2)), wave, 2)
-                told = self.beside(moved, wave)
-                fits.append(
-                    moved if told.covariance is None else replace(moved, covariance=told.covariance)
-                )
-        return sorted(fits, key=lambda fit: -fit.evidence)
+                fits.append(self._settled(self.weighted(self.climb(moved, wave, 2)), wave))
+        return self._sorted(fits)
 
 
 def distinct(fits: Sequence[ResponseFit]) -> list[ResponseFit]:

@@ -14,8 +14,6 @@ CAR = 20.0, 0.2
 to 30 m long (short articulated bodies and metros; the longest of EN 1991-2 and of the UIC have 27
 and 26.4 m)."""
 
-FAMILY = "unlisted"
-
 NUMBERS_APART = 3
 """Numbers of cars that a channel tells apart about a given one, each as likely."""
 
@@ -25,6 +23,8 @@ ALTERNATIVES = NUMBERS_APART * 8
 _NUMBERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 23, 26, 30)
 _CENTRES = (0.62, 0.72)  # over the length of a car, of those that a first look tells apart
 _SHARED = 1.0  # bogies shared by two cars
+_USUAL = 0.70, 0.04  # the same of cars in service: the shipped types have 0.65 to 0.76
+_USUAL_BASE = 0.105, 0.012  # wheelbase over length of a car: they have 0.09 to 0.11
 _BASE = 0.11
 
 CHOICES = ALTERNATIVES * 3 * len(_NUMBERS)
@@ -59,7 +59,7 @@ class EqualCars:
         axles = CAR[0] * (np.array(places) - places[0])
         name = f"{self.cars} equal cars, {self.centres:.2f}, {self.base:.3f}"
         length = self.cars * CAR[0]
-        return TrainType(name, tuple(float(a) for a in axles), self.cars, 1, FAMILY, length)
+        return TrainType(name, tuple(float(a) for a in axles), self.cars, length=length)
 
     def numbers(self) -> list[EqualCars]:
         """The same cars, up to three more or fewer."""
@@ -68,9 +68,18 @@ class EqualCars:
 
     def proportions(self) -> list[EqualCars]:
         """As many cars of other proportions."""
-        centres = (_SHARED,) if self.shared else tuple(np.arange(0.54, 0.80, 0.03))
-        bases = (0.075, 0.09, 0.105, 0.12, 0.14, 0.16)
+        shared = (_SHARED,), (0.12, 0.14, 0.16, 0.18)
+        own = tuple(np.arange(0.61, 0.80, 0.03)), (0.08, 0.095, 0.11, 0.125, 0.14)
+        centres, bases = shared if self.shared else own
         return [EqualCars(self.cars, float(c), b) for c in centres for b in bases]
+
+    @property
+    def prior(self) -> float:
+        """How usual these proportions are (not normalised): builders do not choose them freely."""
+        if self.shared:
+            return 1.0
+        off = (self.centres - _USUAL[0]) / _USUAL[1], (self.base - _USUAL_BASE[0]) / _USUAL_BASE[1]
+        return float(np.exp(-0.5 * (off[0] ** 2 + off[1] ** 2)))
 
 
 def starts() -> Iterator[EqualCars]:
