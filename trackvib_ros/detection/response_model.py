@@ -100,8 +100,9 @@ class Spectrum:
         self.excess = np.zeros(self.f.size)
         if self.usable:
             power = np.abs(self.y) ** 2
-            power = smoothed(power, min(round(_SMOOTH_HZ * size * step), self.f.size // 3))
-            self.excess = np.maximum(power - self.noise, 1e-3 * power + 1e-12 * power.max())
+            width = min(round(_SMOOTH_HZ * size * step), self.f.size // 3)
+            power, noise = smoothed(power, width), smoothed(self.noise, width)
+            self.excess = np.maximum(power - noise, 1e-3 * power + 1e-12 * power.max())
 
     @property
     def usable(self) -> bool:

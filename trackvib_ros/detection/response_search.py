@@ -213,11 +213,15 @@ class Search:
         grid = np.array([(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0)])
         x, y = grid.T
         design = np.stack([np.ones(9), x, y, 0.5 * x * x, x * y, 0.5 * y * y], axis=1)
-        v, a = fit.speed, fit.acceleration
-        value, covariance = fit.evidence, None
+        v, a, covariance = fit.speed, fit.acceleration, None
+        best, highest = (v, a), -np.inf
         for _ in range(steps):
             scale = np.array([dv * v, min(wave * (v / fit.train.span) ** 2, 0.3)])
             values = self.total(fit, v + scale[0] * x, a + scale[1] * y)
+            top = int(np.argmax(values))
+            if values[top] > highest:
+                best = float(v + scale[0] * x[top]), float(a + scale[1] * y[top])
+                highest = float(values[top])
             c = np.linalg.lstsq(design, values, rcond=None)[0]
             bend = -np.array([[c[3], c[4]], [c[4], c[5]]])
             if np.linalg.eigvalsh(bend)[0] > 0:
@@ -225,10 +229,11 @@ class Search:
                 move *= min(1.0, 1.5 / max(float(np.abs(move).max()), 1e-12))
                 covariance = np.linalg.inv(bend) * np.outer(scale, scale)
             else:
-                move, covariance = grid[int(np.argmax(values))], None
-            v, a = v + scale[0] * move[0], a + scale[1] * move[1]
-            value = float(c[0] + c[1:3] @ move - 0.5 * move @ bend @ move)
-        v, a = float(v), float(a)
+                move, covariance = grid[top], None
+            v, a = float(v + scale[0] * move[0]), float(a + scale[1] * move[1])
+        value = float(self.total(fit, np.array([v]), np.array([a]))[0])
+        if value < highest:  # no quadratic at this distance
+            (v, a), value = best, highest
         return replace(fit, speed=v, acceleration=a, evidence=value, covariance=covariance)
 
     def adapted(self, fit: ResponseFit, wave: float, reference: float) -> ResponseFit:
