@@ -58,10 +58,6 @@ def find_passage(
         passage = Passage(reference.interval, traces, reference.band, (), 0, coarse_score=top)
     else:
         passage = fit_hypotheses(usable, trains, limits, site)
-    if unlisted and passage.known and passage.clock_offset:
-        # that its delay fits no type may be for the train is none of them
-        own = next(r for r in records if r.channel.name == passage.traces[0].name)
-        passage = _described(own, within, passage, limits, site)
     if not unlisted or passage.known:
         return passage
     if len(records) < 2:
