@@ -374,16 +374,16 @@ def find_delay(
     travels = float(weights[k] - weights[-1]) - chance
     if evidence < np.log(_EVIDENCE) or travels < np.log(_TRAVELS):
         return None
+    among = np.exp(weights[:-1] - _log_sum(weights[:-1]))
+    sure = float(among[k]) / (1 + np.exp(-travels))
     best, direction = moving[k], 1 if moving[k].delay > 0 else -1
     _, share = views[best.trial.centre]
     speeds, weight = best.trial.posterior(best.delay, best.speed, share)
     speed = float(weight @ speeds)
-    among = np.exp(weights[:-1] - _log_sum(weights[:-1]))
     errors = np.array([direction * np.sign(item.delay) * item.speed - speed for item in moving])
     errors[k] = float(np.sqrt(weight @ (speeds - speed) ** 2))
     place = float(np.hypot(apart[1], 2**0.5 * DEFLECTION_SIGMA)) / baseline
     sigma = float(np.hypot(np.sqrt(among @ errors**2), place * speed))
-    sure = float(among[k]) / (1 + np.exp(-travels))
     return Delay(speed, sigma, direction, sure, best.trial.band(best.delay))
 
 
