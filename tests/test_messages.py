@@ -15,6 +15,7 @@ from sensor_msgs.msg import PointCloud2
 
 from solver import InputError, TrainMotion, load_scenario, train_preset
 from trackvib_ros import messages as m
+from trackvib_ros.channels import EXACT
 from trackvib_ros.detection import Channel, Estimate, TrainEvent
 from trackvib_ros.station import TrainState, WheelsetState
 from trackvib_ros.truth import PassageTruth
@@ -114,9 +115,12 @@ def test_channel_description_says_where_every_sensor_is() -> None:
     groups = {"rail": ("rail_a", "rail_b"), "slab": ("slab_mid",), "bridge": ("bridge_mid",)}
     message = wire(m.channels_message(scenario, groups))
     assert m.read_channels(message) == {  # type: ignore[arg-type]
-        "rail/waveform": [Channel("rail_a", 26.0, "rail"), Channel("rail_b", 46.0, "rail")],
-        "slab/waveform": [Channel("slab_mid", 36.0, "slab")],
-        "bridge/waveform": [Channel("bridge_mid", 36.0, "bridge")],
+        "rail/waveform": [
+            Channel("rail_a", 26.0, "rail", EXACT),
+            Channel("rail_b", 46.0, "rail", EXACT),
+        ],
+        "slab/waveform": [Channel("slab_mid", 36.0, "slab", EXACT)],
+        "bridge/waveform": [Channel("bridge_mid", 36.0, "bridge", EXACT)],
     }
     message.status[0].values.pop(0)  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="rail_a"):

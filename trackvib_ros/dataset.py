@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from solver import InputError, Scenario, Sensor, Simulation, TrainMotion
 from trackvib_ros import __version__, pointcloud, topics
 from trackvib_ros.bag import BagWriter, Qos, Topic, message_definition, type_hash
+from trackvib_ros.channels import channel_values
 from trackvib_ros.dataset_spec import Case, Spec, as_table
 from trackvib_ros.sensor import SensorArray, VirtualSensor
 from trackvib_ros.truth import PassageTruth
@@ -236,8 +237,7 @@ def _write(
             name,
             f"accelerometer on the {by_name[name].layer}",
             {
-                "layer": by_name[name].layer,
-                "x": f"{scenario.channel_x(by_name[name])!r} m",
+                **channel_values(scenario, name),
                 "topic": topics.waveform(group.name),
             },
         )

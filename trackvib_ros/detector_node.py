@@ -46,6 +46,7 @@ class DetectorNode(LifecycleNode):  # type: ignore[misc]
                 value(self, "channel_positions"),
                 value(self, "channel_layers"),
                 value(self, "channel_topics"),
+                value(self, "channel_position_sigma"),
             )
         if value(self, "record_directory"):
             directory = Path(value(self, "record_directory"))

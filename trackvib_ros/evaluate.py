@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from solver import InputError, Scenario, TrainMotion, load_scenario_text
 from trackvib_ros import topics
 from trackvib_ros.bag import BagReader
+from trackvib_ros.channels import read_channel
 from trackvib_ros.detection import (
     VIBRATION,
     Catalogue,
@@ -304,10 +305,9 @@ def read_bag(path: Path) -> Recording:
             for status in reader.decode(message).status:
                 values = {pair.key: pair.value for pair in status.values}
                 try:
-                    x = float(values["x"].removesuffix(" m"))
-                    channels[status.name] = Channel(status.name, x, values["layer"])
-                except (KeyError, ValueError) as failure:
-                    raise InputError(f"bag {path}: channel {status.name!r}: {failure}") from None
+                    channels[status.name] = read_channel(status.name, values)
+                except InputError as failure:
+                    raise InputError(f"bag {path}: {failure}") from None
         truths = []
         passages = names[topics.TRUE_PASSAGES]
         for message in reader.messages(passages) if passages else ():

@@ -25,6 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from solver import InputError, Scenario
 from trackvib_ros import topics
+from trackvib_ros.channels import channel_values, read_channel
 from trackvib_ros.detection import Channel, Estimate, TrainEvent
 from trackvib_ros.pointcloud import decode, encode
 from trackvib_ros.station import TrainState, WheelsetState
@@ -285,8 +286,7 @@ def channels_message(scenario: Scenario, groups: Mapping[str, Sequence[str]]) ->
     for sensor in scenario.sensor:
         channel = by_name[sensor.channel]
         values = {
-            "layer": channel.layer,
-            "x": f"{scenario.channel_x(channel)!r} m",
+            **channel_values(scenario, sensor.channel),
             "topic": waveform_topic(group_of[sensor.channel]).name,
             "axis": "z up",
             "unit": "m/s^2",
@@ -309,12 +309,9 @@ def read_channels(message: DiagnosticArray) -> dict[str, list[Channel]]:
     """
     by_topic: dict[str, list[Channel]] = {}
     for status, values in zip(message.status, _statuses(message), strict=True):
-        try:
-            x = float(values["x"].removesuffix(" m"))
-            channel = Channel(status.name, x, values["layer"])  # type: ignore[arg-type]
-            by_topic.setdefault(values["topic"], []).append(channel)
-        except (KeyError, ValueError) as error:
-            raise InputError(f'channel description of "{status.name}": {error}') from None
+        if "topic" not in values:
+            raise InputError(f"channel description of {status.name!r}: no topic")
+        by_topic.setdefault(values["topic"], []).append(read_channel(status.name, values))
     return by_topic
 
 
@@ -323,8 +320,11 @@ def channels_by_topic(
     positions: Sequence[float] | None,
     layers: Sequence[str] | None,
     topic_names: Sequence[str] | None,
+    position_sigma: float | None = None,
 ) -> dict[str, list[Channel]]:
     """The accelerometers stated by four lists of the same length, by topic.
+
+    ``position_sigma`` is the standard uncertainty of the positions (m).
 
     Raises:
         InputError: the lists differ in length, or an entry is wrong.
@@ -340,7 +340,7 @@ def channels_by_topic(
         raise InputError(f"channel lists must have one entry per accelerometer; {lengths}")
     by_topic: dict[str, list[Channel]] = {}
     for name, x, layer, topic in zip(*lists.values(), strict=True):
-        by_topic.setdefault(topic, []).append(Channel(name, x, layer))
+        by_topic.setdefault(topic, []).append(Channel(name, x, layer, position_sigma))
     return by_topic
 
 

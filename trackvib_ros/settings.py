@@ -29,6 +29,7 @@ DETECTOR_SETTINGS = (
     Setting("channel_positions", NUMBERS, "their x along the track [m]", fixed=True),
     Setting("channel_layers", TEXTS, "rail, slab, support_layer or bridge; each", fixed=True),
     Setting("channel_topics", TEXTS, "waveform topic of each", fixed=True),
+    Setting("channel_position_sigma", 0.02, "of their x [m]", 1e-4, 5.0, fixed=True),
     Setting("best_effort", False, "subscribe to best-effort publishers too", fixed=True),
     Setting("calibration_file", "", "keeps what passages teach; empty: nothing", fixed=True),
     Setting("record_directory", "", "record all topics to this new bag; empty: no", fixed=True),

@@ -70,6 +70,17 @@ def test_text_and_back():
         Calibration.from_json(state.to_json().replace('"offset_m"', '"offset"'))
 
 
+def test_every_position_is_as_well_known_as_its_channel_says():
+    sure = Channel("a", 0.0, position_sigma=0.001)
+    vague = Channel("b", 20.0)
+    state = Calibration.untaught((sure, vague), 0.3)
+    assert state.relative(NAMES)[1][1, 1] == pytest.approx(0.001**2 + 0.3**2, rel=1e-12)
+    # of two equal doubts the one that is larger learns: a metre between them is b's
+    for _ in range(5):
+        state = state.learned(measured(0.5))
+    assert abs(state.offset[0]) < 1e-4 < 0.4 < state.offset[1]
+
+
 def metro(speed, seed):
     return record([Passage(CATALOGUE["metro"].axles, speed)], RAILS, 30, seed, kind="pulse")
 

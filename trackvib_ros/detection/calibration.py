@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 POSITION_SIGMA = 0.02
 """Standard uncertainty (m) of the stated position of a channel: measured along the rail by tape."""
 
-SCHEMA = "trackvib-calibration-2"
+SCHEMA = "trackvib-calibration-3"
 """Name and version of the text that :meth:`Calibration.to_json` writes."""
 
 _MEMORY = 300.0  # passages after which what was learned has faded to what was stated
@@ -56,7 +56,7 @@ class Calibration:
         offset: effective minus stated position (m), shape (channels,); only differences of two
             channels can be observed.
         covariance: of the offsets (m²), shape (channels, channels).
-        stated: standard uncertainty of the stated positions (m).
+        stated: standard uncertainty of the stated positions (m), shape (channels,).
         passages: that were learned from.
         bowl: ln of the wavenumber k0 (rad/m) of the rail's deflection at every channel
             (:mod:`bowl`), shape (channels,).
@@ -67,21 +67,24 @@ class Calibration:
     positions: Array
     offset: Array
     covariance: Array
-    stated: float
+    stated: Array
     passages: int
     bowl: Array
     bowl_variance: Array
 
     @classmethod
     def untaught(cls, channels: Sequence[Channel], stated: float = POSITION_SIGMA) -> Calibration:
-        """The positions as stated, with a standard uncertainty (m)."""
+        """The positions as stated; ``stated`` is the sigma (m) of those that come without one."""
         n = len(channels)
+        sigma = np.array(
+            [stated if c.position_sigma is None else c.position_sigma for c in channels]
+        )
         return cls(
             channels=tuple(channel.name for channel in channels),
             positions=np.array([channel.x for channel in channels]),
             offset=np.zeros(n),
-            covariance=stated**2 * np.eye(n),
-            stated=stated,
+            covariance=np.diag(sigma**2),
+            stated=sigma,
             passages=0,
             bowl=np.full(n, np.log(WAVENUMBER)),
             bowl_variance=np.full(n, WAVENUMBER_SPREAD**2),
@@ -137,7 +140,7 @@ class Calibration:
     def learned(self, found: Measured) -> Calibration:
         """What a passage adds; nothing if it contradicts by more than four standard deviations."""
         rows = self._differences(found.channels)[1:]
-        prior = self.covariance + 2 * self.stated**2 / _MEMORY * np.eye(len(self.channels))
+        prior = self.covariance + np.diag(2 * self.stated**2 / _MEMORY)
         surprise = found.offset[1:] - rows @ self.offset
         expected = rows @ prior @ rows.T + found.covariance[1:, 1:]
         if np.any(np.abs(surprise) > _GATE * np.sqrt(np.diag(expected))):
@@ -199,7 +202,7 @@ class Calibration:
                 "positions_m": self.positions.tolist(),
                 "offset_m": self.offset.tolist(),
                 "covariance_m2": self.covariance.tolist(),
-                "stated_m": self.stated,
+                "stated_m": self.stated.tolist(),
                 "passages": self.passages,
                 "ln_bowl_wavenumber": self.bowl.tolist(),
                 "ln_bowl_variance": self.bowl_variance.tolist(),
@@ -226,7 +229,8 @@ class Calibration:
             covariance = np.array(table["covariance_m2"], dtype=np.float64)
             bowl = np.array(table["ln_bowl_wavenumber"], dtype=np.float64)
             variance = np.array(table["ln_bowl_variance"], dtype=np.float64)
-            stated, passages = float(table["stated_m"]), int(table["passages"])
+            stated = np.array(table["stated_m"], dtype=np.float64)
+            passages = int(table["passages"])
         except (ValueError, KeyError, TypeError) as failure:
             raise InputError(f"calibration: {failure}; give what to_json wrote") from None
         n = len(names)
@@ -237,6 +241,8 @@ class Calibration:
                 f"calibration: offset_m {offset.shape} and covariance_m2 {covariance.shape} must "
                 f"be ({n},) and ({n}, {n}), one per channel"
             )
+        if stated.shape != (n,) or not (np.isfinite(stated).all() and np.all(stated > 0)):
+            raise InputError(f"calibration: stated_m must be {n} positive numbers (m)")
         if bowl.shape != (n,) or variance.shape != (n,):
             raise InputError(
                 f"calibration: ln_bowl_wavenumber {bowl.shape} and ln_bowl_variance "

@@ -58,7 +58,8 @@ class DetectorConfig:
             bogies of a car at ``min_speed``. A train whose bogies follow faster ends sooner.
         max_event: an event longer than this is a changed noise level, not a train (s).
         max_lag: a group this far behind the others is taken for silent (s).
-        position_sigma: standard uncertainty of the channels' positions (m).
+        position_sigma: standard uncertainty (m) of the positions of channels that come without
+            one (:attr:`Channel.position_sigma`).
     """
 
     min_speed: float = 10.0

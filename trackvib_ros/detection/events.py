@@ -35,11 +35,14 @@ class Channel:
         name: name of the channel, as in :attr:`Waveform.channels`.
         x: position along the track (m), positive forward.
         layer: what it is mounted on.
+        position_sigma: standard uncertainty of ``x`` (m); as the detector's settings say if
+            ``None``.
     """
 
     name: str
     x: float
     layer: Layer = "rail"
+    position_sigma: float | None = None
 
     def __post_init__(self) -> None:
         """Check name, layer and position."""
@@ -52,6 +55,11 @@ class Channel:
         number = isinstance(self.x, (int, float, np.number)) and not isinstance(self.x, bool)
         if not number or not abs(self.x) < 1e9:
             raise InputError(f"channel {self.name!r}: x = {self.x!r} must be a finite position (m)")
+        if self.position_sigma is not None and not 1e-4 <= self.position_sigma <= 5:
+            raise InputError(
+                f"channel {self.name!r}: position_sigma = {self.position_sigma} m must lie from "
+                "0.0001 to 5 m"
+            )
 
 
 @dataclass(frozen=True)
