@@ -66,7 +66,6 @@ HELD = 0.95
 """Probability that the family of a named type, and the interval of a speed, hold."""
 
 _TWO_SIDED = 1.96  # sigmas of a Gaussian that hold as much
-_PLACED = 0.45
 _SHORTEST_S = 0.3
 
 
@@ -236,23 +235,6 @@ class ResponsePassage:
         return mean, max(spread, half / _TWO_SIDED), half
 
 
-def _placed(fit: ResponseFit, k: int) -> tuple[float, float]:
-    """When the middle of the train passes a channel (s), sigma: where its response is strongest.
-
-    A response begins before its wheelset and rings after it; computed passages have its centroid
-    within 0.45 of its own width of the wheelset (rms).
-    """
-    model = fit.models[k]
-    time = np.linspace(-model.before, model.after, 400)
-    series = model.response(fit.places, fit.speed, fit.acceleration)
-    at = np.exp(2j * np.pi * np.outer(time + model.centre, model.spectrum.f))
-    weight = np.maximum(np.real(at @ series), 0) ** 2
-    weight /= max(float(weight.sum()), 1e-300)
-    centroid = float(weight @ time)
-    width = float(np.sqrt(weight @ (time - centroid) ** 2))
-    return model.spectrum.epoch + model.centre + centroid, _PLACED * width
-
-
 def _spectral(fit: ResponseFit, k: int) -> tuple[float, float] | None:
     """Speed (m/s, sigma) by the lines of the spectrum alone (multiples of v over the car length).
 
@@ -354,7 +336,9 @@ def find_response(
         choice,
         len(trains),
     )
-    placed = [_placed(told.best, k) for _, k in used]
+    # a train of equal cars is only like the true one
+    unit = CORRELATED if told.listed else tempered(told.best.evidence)
+    placed = [search.passing(told.best, k, unit) for _, k in used]
     return replace(
         told,
         middle=placed[0],

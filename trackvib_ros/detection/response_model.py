@@ -35,6 +35,7 @@ _MODES = 2
 _RINGING = 0.2  # share of the free vibration, of a mode that is told apart from others
 _RINGING_HZ = 40.0
 _RUNG_S = 2.0
+_PLACES = 200  # over the support of a response
 _TOP_HZ = 80.0  # the waveform is low-passed at 100 Hz
 
 
@@ -267,6 +268,29 @@ class Model:
         knots = np.linalg.solve(normal[0], right[0, :, 0])[: t.size]
         series = np.exp(-2j * np.pi * np.outer(s.f, t + self.centre)) @ knots
         return np.asarray(self._shape(places.size, t.size) * series)
+
+    def centroids(self, combs: ComplexArray, wheelsets: int, centres: Array) -> tuple[Array, Array]:
+        """Centroid of the square of the most probable response, after the epoch, and its width (s).
+
+        Args:
+            combs: :meth:`comb` of one motion.
+            wheelsets: their number.
+            centres: trial values of :attr:`centre`, shape (centres,).
+
+        Returns:
+            Both of shape (centres,).
+        """
+        s, t = self.spectrum, self.knots
+        normal, right = self._normal(combs, wheelsets, centres)
+        knots = np.linalg.solve(normal[0], right[0])[: t.size]
+        time = np.linspace(-self.before, self.after, _PLACES)
+        waves = np.exp(2j * np.pi * np.outer(time, s.f)) * self._shape(wheelsets, t.size)
+        series = np.real(waves @ (np.exp(-2j * np.pi * np.outer(s.f, t)) @ knots))
+        energy = np.maximum(series, 0) ** 2
+        energy /= np.maximum(energy.sum(axis=0), 1e-300)
+        centroid = time @ energy
+        width = np.sqrt(np.maximum(time**2 @ energy - centroid**2, 0.0))
+        return np.asarray(centres + centroid), np.asarray(width)
 
     def shares(
         self, groups: Sequence[Array], places: Array, speed: float, acceleration: float

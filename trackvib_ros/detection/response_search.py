@@ -43,6 +43,7 @@ _MIDDLE, _FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
 _DECELERATION = 0.4  # of the speed, largest change over a passage
 _LARGEST = 1.0  # m/s²
+_PLACED = 0.45  # of its own width, distance of the centroid of a response from its wheelset
 _NEIGHBOUR = 0.3  # cycles at the ends of a train between trial motions
 _PART = 6  # wheelsets, at least, whose amplitude is measured by itself
 _SHRUNK, _WEAKEST, _HEAVIEST = 1.5, 0.65, 2.5
@@ -429,6 +430,37 @@ class Search:
         values = np.array([float(self.total(each, v, a)[0]) for each in near])
         best = near[int(np.argmax(values))]
         return replace(best, evidence=float(values.max())), values
+
+    def passing(self, fit: ResponseFit, k: int, unit: float) -> tuple[float, float]:
+        """When the middle of the train passes the channel of observation ``k`` (s), sigma.
+
+        A response begins before its wheelset and rings after it; computed passages have its
+        centroid within 0.45 of its own width of the wheelset (rms). Which support it has, and
+        where, is known as far as the evidence tells: mean and spread over all that are tried.
+
+        Args:
+            unit: difference of evidence that stands for a factor e.
+        """
+        old = fit.models[k]
+        top, step = float(old.spectrum.f[-1]), _FINE / fit.speed
+        far = _REACHES[0] / fit.speed
+        centres = old.centre + np.arange(-far, far + 0.5 * step, step)
+        values, places, widths = [], [], []
+        for reach, ring in itertools.product(_REACHES, _RINGS):
+            before = reach / fit.speed
+            spectrum = Spectrum(self.seen[k], 2 * before + ring, top)
+            model = replace(old, spectrum=spectrum, before=before, after=before + ring)
+            combs = self._own(k, model, fit)
+            values.append(model.evidence(combs, fit.places.size, centres)[0])
+            place, width = model.centroids(combs, fit.places.size, centres)
+            places.append(place)
+            widths.append(width)
+        value, place, width = (np.concatenate(each) for each in (values, places, widths))
+        weight = np.exp((value - value.max()) / unit)
+        weight /= weight.sum()
+        mean = float(weight @ place)
+        variance = float(weight @ ((place - mean) ** 2 + (_PLACED * width) ** 2))
+        return old.spectrum.epoch + mean, float(np.sqrt(variance))
 
     def _own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
         v, a = np.array([fit.speed]), np.array([fit.acceleration])
