@@ -53,6 +53,10 @@ def test_the_first_train_does_not_wait_for_the_second(monkeypatch):
     arrivals = [event.stamp_ns * 1e-9 for _, event in events if event.kind == "arrival"]
     assert len(arrivals) == 2 and arrivals[1] > first.axle_times(0.0)[-1]
     assert abs(arrivals[1] - second.start) < 0.3
+    # the channels begin to hear the second train at different times
+    updates = [event.values["speed"] for _, event in events if event.kind == "update"]
+    assert len(updates) == 4
+    assert all(abs(told.value - SPEED) < 4 * told.sigma < 0.03 * SPEED for told in updates)
     # what was found when the train was told is not sought again when its event ends
     assert len(searches) == 2
 

@@ -342,11 +342,11 @@ def find_delay(
         apart: distance of the channels, its standard uncertainty (m).
     """
     baseline = apart[0]
-    # a record that begins inside a train begins in both channels at once
+    # before its own beginning a channel had another train; none is cut off where the other has none
     known = [record.window.time[record.window.valid] for record in (first, second)]
     if not all(time.size for time in known):
         return None
-    begun = max(float(time[0]) for time in known)
+    begun = min(float(time[0]) for time in known)
     within = max(within[0], begun), within[1]
     waves = [deflection(record.window, within) for record in (first, second)]
     traces = [record.traces(within) for record in (first, second)]
@@ -425,7 +425,8 @@ def _order(
         for record, trace in zip(records, pair, strict=True):
             low, high = record.window.bands[band]
             found = strong_interval(trace, high - low, within)
-            if found is not None and found[0] > within[0] + _KNOWN_START:
+            own = max(within[0], float(trace.time[trace.valid][0]))
+            if found is not None and found[0] > own + _KNOWN_START:
                 starts.append(found[0])
         if len(starts) == 2:
             z = (starts[1] - starts[0] - delays) / sigma

@@ -412,7 +412,8 @@ class TrainDetector:
             return None
         if event.speed is not None:
             speed, sigma = event.speed
-            wait = 1e9 * self._clear_s(speed + 2 * sigma)
+            # what is strong stays so beyond its wheelset: no margin
+            wait = 1e9 * self.catalogue.longest_gap / (speed + 2 * sigma)
         else:
             latest = max(quiet, key=lambda c: event.strong_ns[c])
             before, after = event.lull_ns[latest]
