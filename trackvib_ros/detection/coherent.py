@@ -120,7 +120,10 @@ def _in_phase(
 def _filtered(
     wavenumber: Array, product: NDArray[np.complex128], own: Array, reach: float
 ) -> Array:
-    """Matched filter output every :data:`_FINE` m from ``reach`` before the first wheelset on."""
+    """Matched filter output every :data:`_FINE` m from ``reach`` before the first wheelset on.
+
+    Zero beyond the length of the transform, which holds all of the waveform.
+    """
     count = int(np.ceil((own[-1] - own[0] + 2 * reach) / _FINE)) + 2
     step = wavenumber[1] - wavenumber[0]
     size = round(2 * np.pi / (step * _FINE))
@@ -128,7 +131,8 @@ def _filtered(
     first = round(float(wavenumber[0] / step))
     table[first : first + wavenumber.size] = product * np.exp(-1j * wavenumber * reach)
     # exp(+i k s) at s = n _FINE - reach, on the grid of the transform
-    return np.asarray(np.real(fft.ifft(table) * size)[:count])
+    output = np.real(fft.ifft(table) * size)[:count]
+    return np.pad(output, (0, count - output.size))
 
 
 def _grid(reach: float) -> Array:
