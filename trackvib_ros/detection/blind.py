@@ -276,7 +276,7 @@ def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion,
     motion, way = found.motion, found.direction
     tables = [
         likelihood(
-            Wave(r.window.time - r.window.low_shift, r.window.low, r.window.measured),
+            r.wave(),
             motion,
             places + ahead,
         )

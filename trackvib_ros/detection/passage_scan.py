@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from .catalogue import TrainType
 from .evidence import PRIOR_CLOCK, PRIOR_UNKNOWN
-from .health import clipped
 from .kinematics import Motion
 from .pattern import FASTEST, SLOWEST, Match, Trace, independent, refine, scan, stretched
 from .place import Wave
@@ -79,10 +78,7 @@ def scan_channel(
     found = []
     whole = record.traces(within)
     window = record.window
-    inside = (window.time >= within[0]) & (window.time <= within[1])
-    wave = Wave(
-        window.time - window.low_shift, window.low, window.measured, clipped(window, inside)
-    )
+    wave = record.wave(within)
     for trace, limited, band in zip(
         whole, record.traces(within, limited=True), window.bands, strict=True
     ):

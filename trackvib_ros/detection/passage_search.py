@@ -13,7 +13,6 @@ from .catalogue import Catalogue, TrainType
 from .passage import CONFIRM_SCORE, Passage
 from .passage_fit import CERTAIN, fit_hypotheses
 from .passage_scan import HOPELESS_SCORE, scan_channel
-from .place import Wave
 from .record import Record
 from .single import Shown
 from .strength import excited, quiet_gaps
@@ -122,8 +121,7 @@ def bowl_of(record: Record, passage: Passage) -> Corner | None:
     ``None`` if the type, or the deflection, is not beyond doubt.
     """
     best = passage.hypotheses[0]
-    window = record.window
-    wave = Wave(window.time - window.low_shift, window.low, window.measured)
+    wave = record.wave()
     if best.probability < CERTAIN:
         return None
     apart = passage.direction * (record.channel.x - passage.traces[0].x)

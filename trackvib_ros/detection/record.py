@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from .events import Channel
 from .features import Window
+from .health import clipped
 from .pattern import Trace
+from .place import Wave
 
 Array = NDArray[np.float64]
 
@@ -29,6 +31,13 @@ class Record:
         names = ("time", "energy", "low", "peak", "flat", "valid", "holes")
         kept = {name: getattr(window, name)[part] for name in names}
         return replace(self, window=replace(window, **kept))
+
+    def wave(self, within: tuple[float, float] | None = None) -> Wave:
+        """The waveform below 100 Hz; whether it was clipped is asked of an interval (s)."""
+        window = self.window
+        time = window.time
+        cut = within is not None and clipped(window, (time >= within[0]) & (time <= within[1]))
+        return Wave(time - window.low_shift, window.low, window.measured, cut)
 
     def traces(self, within: tuple[float, float], limited: bool = False) -> list[Trace]:
         """One trace per band, quiet outside an interval (s); levels ``limited`` on request."""

@@ -37,7 +37,6 @@ from scipy import fft
 
 from . import travel
 from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD, Corner, corner, low_pass
-from .health import clipped
 from .kinematics import PRIOR_ACCELERATION, Motion
 from .pattern import Trace
 from .place import Wave
@@ -129,9 +128,7 @@ class Shown:
     @cached_property
     def wave(self) -> Wave:
         """The waveform below 100 Hz."""
-        window = self.record.window
-        cut = clipped(window, (window.time >= self.within[0]) & (window.time <= self.within[1]))
-        return Wave(window.time - window.low_shift, window.low, window.measured, cut)
+        return self.record.wave(self.within)
 
     @property
     def quiet(self) -> float:
