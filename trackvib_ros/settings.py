@@ -2,6 +2,7 @@
 
 from rclpy.parameter import Parameter
 
+from trackvib_ros.detection import POSITION_SIGMA, POSITION_SIGMA_RANGE
 from trackvib_ros.process import Setting
 
 DAY = 86400.0
@@ -29,7 +30,9 @@ DETECTOR_SETTINGS = (
     Setting("channel_positions", NUMBERS, "their x along the track [m]", fixed=True),
     Setting("channel_layers", TEXTS, "rail, slab, support_layer or bridge; each", fixed=True),
     Setting("channel_topics", TEXTS, "waveform topic of each", fixed=True),
-    Setting("channel_position_sigma", 0.02, "of their x [m]", 1e-4, 5.0, fixed=True),
+    Setting(
+        "channel_position_sigma", POSITION_SIGMA, "of x [m]", *POSITION_SIGMA_RANGE, fixed=True
+    ),
     Setting("best_effort", False, "subscribe to best-effort publishers too", fixed=True),
     Setting("calibration_file", "", "keeps what passages teach; empty: nothing", fixed=True),
     Setting("record_directory", "", "record all topics to this new bag; empty: no", fixed=True),

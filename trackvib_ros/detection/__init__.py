@@ -13,10 +13,20 @@ from .arrays import detect
 from .calibration import Calibration
 from .catalogue import Catalogue, TrainType
 from .detector import DetectorConfig, TrainDetector
-from .events import CONFIRMED, VIBRATION, Channel, Estimate, TrainEvent
+from .events import (
+    CONFIRMED,
+    POSITION_SIGMA,
+    POSITION_SIGMA_RANGE,
+    VIBRATION,
+    Channel,
+    Estimate,
+    TrainEvent,
+)
 
 __all__ = [
     "CONFIRMED",
+    "POSITION_SIGMA",
+    "POSITION_SIGMA_RANGE",
     "VIBRATION",
     "Calibration",
     "Catalogue",

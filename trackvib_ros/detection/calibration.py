@@ -22,12 +22,9 @@ from numpy.typing import NDArray
 from solver import InputError
 
 from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD
-from .events import Channel
+from .events import POSITION_SIGMA, Channel
 
 Array = NDArray[np.float64]
-
-POSITION_SIGMA = 0.02
-"""Standard uncertainty (m) of the stated position of a channel: measured along the rail by tape."""
 
 SCHEMA = "trackvib-calibration-3"
 """Name and version of the text that :meth:`Calibration.to_json` writes."""

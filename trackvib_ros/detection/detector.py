@@ -14,10 +14,10 @@ from solver import InputError
 from trackvib_ros.waveform import Waveform
 
 from . import report
-from .calibration import POSITION_SIGMA, Calibration
+from .calibration import Calibration
 from .catalogue import Catalogue
 from .closing import Closing, Ended
-from .events import Channel, TrainEvent
+from .events import POSITION_SIGMA, Channel, TrainEvent, check_position_sigma
 from .group import LEAST_BINS, Group
 from .head import HeadMatcher
 from .kinematics import Motion
@@ -80,10 +80,7 @@ class DetectorConfig:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise InputError(f"{name} = {value} s must lie from {low} to {high} s")
-        if not 1e-4 <= self.position_sigma <= 5:
-            raise InputError(
-                f"position_sigma = {self.position_sigma} m must lie from 0.0001 to 5 m"
-            )
+        check_position_sigma(self.position_sigma)
 
 
 @dataclass

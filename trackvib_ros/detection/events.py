@@ -26,6 +26,23 @@ EVENT_KINDS: tuple[EventKind, ...] = (
 VIBRATION = "vibration event"
 CONFIRMED = "train confirmed"
 
+POSITION_SIGMA = 0.02
+"""Standard uncertainty (m) of the stated position of a channel: measured along the rail by tape."""
+POSITION_SIGMA_RANGE = (1e-4, 5.0)
+"""What a position's standard uncertainty may be (m)."""
+
+
+def check_position_sigma(sigma: float, whose: str = "") -> None:
+    """Check the standard uncertainty of a position (m).
+
+    Raises:
+        InputError: not a number in :data:`POSITION_SIGMA_RANGE`.
+    """
+    low, high = POSITION_SIGMA_RANGE
+    number = isinstance(sigma, (int, float, np.number)) and not isinstance(sigma, bool)
+    if not number or not low <= sigma <= high:
+        raise InputError(f"{whose}position_sigma = {sigma!r} m must lie from {low} to {high} m")
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -55,11 +72,8 @@ class Channel:
         number = isinstance(self.x, (int, float, np.number)) and not isinstance(self.x, bool)
         if not number or not abs(self.x) < 1e9:
             raise InputError(f"channel {self.name!r}: x = {self.x!r} must be a finite position (m)")
-        if self.position_sigma is not None and not 1e-4 <= self.position_sigma <= 5:
-            raise InputError(
-                f"channel {self.name!r}: position_sigma = {self.position_sigma} m must lie from "
-                "0.0001 to 5 m"
-            )
+        if self.position_sigma is not None:
+            check_position_sigma(self.position_sigma, f"channel {self.name!r}: ")
 
 
 @dataclass(frozen=True)
