@@ -49,6 +49,8 @@ _INNER_RATE = 5000.0  # Hz, band filters run at this rate or up to twice it
 _INNER_TOP = 1700.0  # Hz
 _RECURSIVE = np.array([1.0, 0.0])  # keeps lfilter from convolving, whose rounding follows the block
 _FILL_S = 0.02  # longer holes are marked invalid instead of interpolated
+_BESIDE_S = 0.005  # of samples on either side of a short hole, whose means a line bridges
+_LEAST_MEASURED = 0.3  # of a frame
 _MEAN_S = 0.06  # before a long hole, half the memory of the lowest band's high-pass
 _SETTLE_S = 0.05  # bins after a hole that the filters still remember
 _BRIDGED_S = 0.015  # after a hole that is interpolated; exp(-2 pi 100 Hz t) is 1e-4
@@ -104,7 +106,7 @@ class Frame:
     """About 10 ms of a group, per channel: see :class:`Window`.
 
     Attributes:
-        energy: shape (channels, bands).
+        energy: of what was measured, shape (channels, bands); NaN where that is too little.
         valid: mostly measured.
         still: not one sample differs from the one before.
         mean: of the raw samples.
@@ -137,6 +139,12 @@ def _freedom(power: Array, width: float, time: float) -> float:
     measurement of power spectra, 1958); 2 B T for a rectangular band of width B.
     """
     return float(2 * time * width * power.sum() ** 2 / np.sum(power**2))
+
+
+def _runs(true: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Begin and end of every stretch of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.view(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _moving_high_pass(low: float, rate: float) -> Array:
@@ -228,6 +236,8 @@ class GroupStream:
         self._last = np.full(n, np.nan)
         self._held = np.zeros(n)
         self._past = np.full((max(1, int(_MEAN_S * self.rate)), n), np.nan)
+        self._beside = max(1, round(_BESIDE_S * self.rate))
+        self._delay = np.rint(self.shift / self.step).astype(np.int64)
         self._in_hole = np.zeros(n, dtype=bool)
         # the filters start on one sample, whose own departure from the mean must fade
         self._unsettled = np.full(n, int(_SETTLE_S * self.rate))
@@ -286,7 +296,8 @@ class GroupStream:
             return
         raw = np.concatenate(self._pending) if len(self._pending) > 1 else self._pending[0]
         # as far as a hole that starts before ``count`` can matter
-        bad = ~np.isfinite(raw[: count + int(_FILL_S * self.rate) + 2])
+        ahead = int(_FILL_S * self.rate) + self._beside + 2
+        bad = ~np.isfinite(raw[: count + ahead])
         if bad.any() and not flush:
             count = self._resolved(bad, count)
             if count <= 0:
@@ -311,18 +322,16 @@ class GroupStream:
         self._pending_count -= count
 
     def _resolved(self, bad: NDArray[np.bool_], count: int) -> int:
-        """Samples that can be conditioned now: a short hole waits for its far end."""
+        """Samples that can be conditioned now: a short hole waits for what follows it."""
         limit = int(_FILL_S * self.rate)
-        for column in bad[: count + limit + 1].T:
-            if count <= 0 or not column[count - 1]:
-                continue
-            first = count - 1
-            while first > 0 and column[first - 1]:
-                first -= 1
-            ahead = column[first:]
-            length = len(ahead) if ahead.all() else int(np.argmin(ahead))
-            if length == len(ahead) and length <= limit:
-                count = min(count, first)
+        for column in bad.T:
+            for first, last in _runs(column):
+                if first >= count:
+                    break
+                after = column[last : last + self._beside]
+                waits = last == column.size or (after.size < self._beside and not after.any())
+                if waits and last - first <= limit:
+                    count = first
         return count - count % self.decimation
 
     def _fill_holes(
@@ -337,8 +346,7 @@ class GroupStream:
             if not column[:count].any():
                 self._last[c] = x[-1, c]
                 continue
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], column.view(np.int8), [0]])))
-            for first, last in zip(edges[::2], edges[1::2], strict=True):
+            for first, last in _runs(column):
                 if first >= count:
                     break
                 before = x[first - 1, c] if first else self._last[c]
@@ -347,11 +355,21 @@ class GroupStream:
                 stop = min(last, count)
                 long = last - first > limit or last == len(column) or (carried and first == 0)
                 if not long:
-                    weight = np.arange(1, stop - first + 1) / (last - first + 1)
-                    x[first:stop, c] = before + weight * (raw[last, c] - before)
+                    after = raw[last : last + self._beside, c]
+                    after = after[: np.argmin(np.append(np.isfinite(after), False))]
+                    known = self._before(x[:first, c], c)[-self._beside :]
+                    start = float(known.mean()) if known.size else before
+                    end = float(after.mean())
+                    # from the middle of the samples before to that of those after
+                    ahead = 0.5 * (known.size + 1)
+                    length = last - first - 1 + ahead + 0.5 * (after.size + 1)
+                    weight = (np.arange(stop - first) + ahead) / length
+                    x[first:stop, c] = start + weight * (end - start)
                 else:
                     if not (carried and first == 0):
-                        self._held[c] = self._mean_before(x[:first, c], c, before)
+                        known = self._before(x[:first, c], c)
+                        # a last sample off the mean would step out of the filters
+                        self._held[c] = float(known.mean()) if known.size else before
                     x[first:stop, c] = self._held[c]
                     settled = int(_SETTLE_S * self.rate)
                     invalid[first : stop + settled, c] = True
@@ -362,11 +380,10 @@ class GroupStream:
         holes = bad[:count].reshape(shape).mean(axis=1)
         return x, holes, np.asarray(invalid.reshape(shape).any(axis=1))
 
-    def _mean_before(self, x: Array, channel: int, last: float) -> float:
-        """Mean of a channel before a hole: a last sample off it would step out of the filters."""
+    def _before(self, x: Array, channel: int) -> Array:
+        """Samples of a channel before a hole, as many as are kept."""
         known = np.concatenate([self._past[:, channel], x])[-len(self._past) :]
-        known = known[np.isfinite(known)]
-        return float(known.mean()) if known.size else last
+        return np.asarray(known[np.isfinite(known)])
 
     def _filter(self, x: Array, holes: Array, invalid: NDArray[np.bool_]) -> None:
         n, d = len(x) // self.decimation, self.decimation
@@ -435,11 +452,40 @@ class GroupStream:
         mean = part.mean(axis=0, dtype=np.float64)
         b = len(self.bands)
         return Frame(
-            energy=mean[:, :b],
+            energy=self._without_holes(mean[:, :b], start, self.frame_bins),
             valid=mean[:, b + 3] > 0.7,
             still=part[:, :, b + 2].min(axis=0) >= self.decimation,
             mean=mean[:, b + 5],
         )
+
+    def _without_holes(self, mean: Array, start: int, count: int) -> Array:
+        """Mean energies of bins of the ring that holes have no share in, (channels, bands).
+
+        NaN for a band of which too little was measured.
+
+        Args:
+            mean: that of all bins.
+            start: first bin.
+            count: number of bins.
+        """
+        b = len(self.bands)
+        before = max(start - int(self._delay.max()), 0)
+        holes = self._ring[before : start + count, :, b + 4]
+        if not holes.any():
+            return mean
+        out = np.array(mean)
+        for k, delay in enumerate(self._delay):
+            # at the start of a stream there is less to look back on
+            whole = np.zeros((count, len(out)), dtype=bool)
+            first, last = (max(int(i - delay), 0) for i in (start, start + count))
+            seen = self._ring[first:last, :, b + 4] == 0
+            whole[count - len(seen) :] = seen
+            measured = whole.sum(axis=0)
+            part = self._ring[start : start + count, :, k].astype(np.float64)
+            energy = np.where(whole, part, 0.0).sum(axis=0)
+            enough = measured >= _LEAST_MEASURED * count
+            out[:, k] = np.where(enough, energy / np.maximum(measured, 1), np.nan)
+        return out
 
     def measured(self, channel: int, until_ns: int) -> Array:
         """Energies of the measured frames up to a time, shape (frames, bands).

@@ -208,8 +208,10 @@ class Trigger:
     def step(self, energy: Array, valid: NDArray[np.bool_], frozen: bool) -> NDArray[np.bool_]:
         """Take one frame of energies (channels, bands); say which channels are active.
 
-        Invalid frames leave floor and history untouched. ``frozen`` holds the floor.
+        Invalid frames leave floor and history untouched; a band that was not measured (NaN) keeps
+        its level. ``frozen`` holds the floor.
         """
+        energy = np.where(np.isnan(energy), self._history[0], energy)
         usable = valid & np.all(energy > 0, axis=1)
         if usable.all():
             self._history[1:] = self._history[:-1]

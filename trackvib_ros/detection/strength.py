@@ -19,6 +19,11 @@ def smoothed(trace: Trace, width_s: float) -> Array:
     return trace.mean(trace.time - width_s / 2, trace.time + width_s / 2)
 
 
+def _measured(trace: Trace, width_s: float) -> Array:
+    """Part of ``width_s`` about every bin that was measured."""
+    return trace.coverage(trace.time - width_s / 2, trace.time + width_s / 2)
+
+
 def strong(
     trace: Trace, bandwidth: float, within: tuple[float, float], below: float = STRONG
 ) -> NDArray[np.bool_]:
@@ -28,8 +33,8 @@ def strong(
     if not inside.any():
         return inside
     top = float(np.percentile(energy[inside], 95))
-    freedom = max(2 * bandwidth * 0.04, 2.0)
-    limit = max(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top * below)
+    freedom = np.maximum(2 * bandwidth * 0.04 * _measured(trace, 0.04), 2.0)
+    limit = np.maximum(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top * below)
     return np.asarray(inside & (energy > limit))
 
 
