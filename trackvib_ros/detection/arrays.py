@@ -14,6 +14,7 @@ from trackvib_ros.waveform import Waveform
 from .catalogue import Catalogue
 from .detector import DetectorConfig, TrainDetector
 from .events import Channel, TrainEvent
+from .hum import without_hum
 
 Array = NDArray[np.float64]
 
@@ -81,7 +82,8 @@ def detect(
     data = _in_range(data)
     events: list[TrainEvent] = []
     for (first, last), stamp in zip(pieces, start_ns, strict=True):
-        block = Waveform(int(stamp), dt_ns, names, data[first:last].astype(np.float32))
+        part = _without_hum(data[first:last], 1e9 / dt_ns)
+        block = Waveform(int(stamp), dt_ns, names, part.astype(np.float32))
         events += detector.process(block)
     return _corrected(events + detector.finish())
 
@@ -145,6 +147,17 @@ def _in_range(data: Array) -> Array:
             column -= np.median(column[known])
             column[:] = _to_one(column, known)
     return data
+
+
+def _without_hum(data: Array, rate: float) -> Array:
+    """Samples of a piece without mains hum, NaN where they were."""
+    out: Array = np.array(data)
+    for column in out.T:
+        known = np.flatnonzero(np.isfinite(column))
+        if known.size > 0.5 * column.size:
+            whole = np.interp(np.arange(column.size), known, column[known])
+            column[known] += (without_hum(whole, rate) - whole)[known]
+    return out
 
 
 def _to_one(column: Array, known: NDArray[np.bool_]) -> Array:
