@@ -70,6 +70,14 @@ def test_the_delay_tells_speed_and_direction_within_its_sigma(kind, seen):
     assert relative < (0.004 if kind == "pulse" else 0.015)  # 2 cm; 25 cm of 20 m
 
 
+def test_the_sigma_in_noise_is_that_of_the_error():
+    told = [train(seed, "pulse", 0, 45.0) for seed in range(24)]
+    z = [(delay.speed - truth.speed) / delay.sigma for truth, delay in told if delay is not None]
+    assert len(z) > 20
+    # chi squared of 21 to 24 at 99 %: 0.62 to 1.41
+    assert 0.62 < np.sqrt(np.mean(np.square(z))) < 1.41
+
+
 def test_cars_as_long_as_the_channels_are_apart_are_not_taken_for_each_other():
     # a metro's 19.5 m on 20 m: the next car reaches both channels as if at once
     for seed in range(6):

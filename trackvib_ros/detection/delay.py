@@ -58,6 +58,7 @@ _LEAST_OVERLAP = 6.0  # m that both channels must have seen: the wheelsets of a 
 _CANDIDATES = 5  # delays that are weighed by what is left of the signals
 _LOOKS = 40  # delays either side of one, at most, at which it is compared with others
 _PARTS = 8  # of the step between delays, for the posterior
+_CORRELATED = 6.0  # m, of what channels do not share: three of the longest waves; flat from 3 to 12
 _NEAR = 1.0  # m about a delay: beyond, another wheelset is taken for this one
 _EVIDENCE = 1e4  # likelihood ratio to chance at which a delay is told
 _TRAVELS = 19.0  # the same to what comes at once: 95 %
@@ -259,7 +260,8 @@ class _Trial:
         near = self.near(delay, speed)
         lags = np.linspace(near.lags[0], near.lags[-1], 1 + _PARTS * (near.lags.size - 1))
         r, overlap = self.compare(near.lags)
-        pairs = self._pairs(near.lags[np.argmax(r, axis=1)])
+        # where energies peak is in doubt by where a wheel shows itself in them, not by noise
+        pairs = np.concatenate([[self._pairs(int(near.lags[np.argmax(r[0])]))], share[1:]])
         overlap = np.interp(lags, near.lags, overlap)
         r = np.clip(CubicSpline(near.lags, r, axis=1)(lags), -_MOST, _MOST)
         log = log_ratio(r, pairs[:, None] * overlap)
@@ -271,38 +273,36 @@ class _Trial:
         weight = np.exp(total - total.max())
         return self.baseline * self.centre / _STEP / way, weight / weight.sum()
 
-    def _pairs(self, lags: NDArray[np.int64]) -> Array:
-        """Independent pairs a cell that make a peak as wide as its place is uncertain.
+    def _pairs(self, lag: int) -> float:
+        """Independent pairs a cell that make a peak of the waveform as wide as it is uncertain.
 
-        The place is where sum(u) = 0, u = (a b' - a' b) / 2, which is zero wherever both are alike;
-        its variance is var(sum(u)) / sum(a' b')², by what the channels differ over every piece of
-        the train, pieces the longest wave of the filter (sandwich estimate; Ribatet, Cooley &
-        Davison, Statistica Sinica 22, 2012, 813; Newey & West, Econometrica 55, 1987, 703).
+        The place is where a = m - d / 2 and b = m + d / 2 have sum(m' d) = 0; its variance is that
+        of the sum over sum(a' b')². What the channels do not share, d, is noise of any colour over
+        all that was seen: the variance of the sum is the sum of the products of the autocovariances
+        of m' and d (Bartlett's formula; Box & Jenkins, Time Series Analysis, sec. 11.1.3), those
+        beyond a few waves left out by degrees (Newey & West, Econometrica 55, 1987, 703).
 
         Args:
-            lags: of the peaks, one per signal.
+            lag: of the peak.
         """
-        out = np.zeros(lags.size)
-        piece = round(BROAD / CELL)
-        for row, lag in enumerate(lags):
-            a, b = self._cut(int(lag))[:, row]
-            if a.size <= 3 * piece:
-                continue
-            slope, other = np.gradient(a), np.gradient(b)
-            bend = float(slope @ other)
-            norm = float(np.sqrt((a @ a) * (b @ b)))
-            r = min(float(a @ b) / max(norm, 1e-300), _MOST)
-            if bend <= 0 or r <= 0:
-                continue
-            u = 0.5 * (a * other - slope * b)
-            u -= float(u.sum()) / bend * slope * other
-            moving = np.convolve(u, np.ones(piece))
-            variance = float(moving @ moving) / piece / bend**2
-            # estimated from so few pieces: that of Student's distribution
-            count = a.size / piece
-            variance *= (count - 1) / (count - 3)
-            out[row] = (1 - r * r) / (r * bend / norm * max(variance, 1e-300)) / a.size
-        return out
+        a, b = self._cut(lag)[:, 0]
+        a, b = (x / max(float(np.sqrt(x @ x)), 1e-150) for x in (a, b))
+        count = a.size
+        if count < 2:
+            return 0.0
+        bend = float(np.gradient(a) @ np.gradient(b))
+        r = min(float(a @ b), _MOST)
+        if bend <= 0 or r <= 0:
+            return 0.0
+        size = int(fft.next_fast_len(2 * count, real=True))
+        slope, left = (
+            fft.irfft(np.abs(fft.rfft(x, size)) ** 2, size)[:count]
+            for x in (np.gradient(0.5 * (a + b)), b - a)
+        )
+        weight = np.maximum(1 - np.arange(count) * (CELL / _CORRELATED), 0.0)
+        weight[1:] *= 2
+        variance = float(weight @ (slope * left)) / count / bend**2
+        return float((1 - r * r) / (r * bend * max(variance, 1e-300)) / count)
 
 
 def _over_bands(log: Array, blur: int) -> Array:
