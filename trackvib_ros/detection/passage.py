@@ -45,6 +45,11 @@ significant as :data:`SCATTERED_SCORE` of one (1 - r² is the root of that of on
 IN_PHASE = 30.0
 """ln of the likelihood at which the deflection shows a train: odds of e^20 after all its trials."""
 
+IN_PLACE = 30.0
+"""The same of wheelsets whose places agree, two channels in step."""
+
+_WINDOW = 2.2  # m, in which a wheelset is looked for
+
 LEAST_SEEN = 8
 """Wheelsets of a pattern (two cars) to be seen on one channel, all where a train has fewer: three
 blows of a hammer in the right places have the correlation of a railcar on three bogies."""
@@ -161,10 +166,19 @@ class Passage:
         shown = max(fit.in_phase, self.hypotheses[0].phase if self.unknown < 0.5 else 0.0)
         if shown > IN_PHASE and self.direction != 0:
             return self.score >= IN_STEP_SCORE
-        if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))):
+        if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))) and not (
+            self.direction != 0 and self._in_place > IN_PLACE
+        ):
             return False
         doubted = self.direction == 0 and self._doubted(SCATTERED)
         return self.score >= (SCATTERED_SCORE if doubted else least)
+
+    @property
+    def _in_place(self) -> float:
+        """ln of the likelihood that wheelsets lie where the type has them, not anywhere."""
+        fit = self.hypotheses[0].fit
+        gain = np.log(_WINDOW / (np.sqrt(2 * np.pi) * max(fit.scale, 1e-3))) - 0.5
+        return float(fit.used.sum() * gain)
 
     @property
     def confirmed(self) -> bool:

@@ -1,0 +1,60 @@
+"""Whether wheelsets whose energy hardly rises over what is beside them are seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trackvib_ros.detection import Catalogue
+from trackvib_ros.detection.axles import AxleFit
+from trackvib_ros.detection.kinematics import regress
+from trackvib_ros.detection.passage import IN_PLACE, Hypothesis, Passage
+from trackvib_ros.detection.pattern import Trace
+
+METRO = Catalogue.default().types[[t.name for t in Catalogue.default().types].index("metro")]
+SPEED, APART = 40.0, 20.0  # m/s, m
+
+
+def _passage(scatter: np.ndarray, direction: int = 1) -> Passage:
+    """A train on two channels, wheelsets off their places by ``scatter`` (m), none with contrast."""
+    places = np.stack([METRO.axles, METRO.axles + APART])
+    time = (places + scatter) / SPEED
+    channel = np.repeat([0, 1], METRO.axles.size)
+    fit = regress(time.ravel(), places.ravel(), channel, 0.0, position_sigma=0.3)
+    axles = AxleFit(
+        motion=fit.motion,
+        scale=fit.scale,
+        time=time,
+        residual=fit.residual.reshape(time.shape),
+        contrast=np.full(time.shape, 0.2),
+        observed=np.ones(time.shape, dtype=bool),
+        offset=fit.offset,
+        place_sigma=np.full(2, 0.2),
+    )
+    grid = np.arange(0.0, 10.0, 0.001)
+    trace = Trace("a", 0.0, grid, np.ones(grid.size), np.ones(grid.size, bool), 1.0, 0.001)
+    return Passage(
+        interval=(0.0, 5.0),
+        traces=(trace, trace),
+        band=(5.0, 150.0),
+        hypotheses=(Hypothesis(METRO, False, direction, 0.68, axles, probability=1.0),),
+        direction=direction,
+    )
+
+
+def test_wheelsets_in_their_places_are_seen_without_contrast():
+    rng = np.random.default_rng(1)
+    shape = (2, METRO.axles.size)
+    exact = _passage(rng.normal(0.0, 0.05, shape))
+    # uniform in 2.2 m against normal of 5 cm: ln(2.2 / 0.125) - 1/2 a wheelset
+    assert exact._in_place == pytest.approx(shape[1] * 2 * 2.37, rel=0.15)
+    assert exact.confirmed
+    assert not _passage(rng.normal(0.0, 0.05, shape), direction=0).confirmed
+
+
+def test_wheelsets_anywhere_are_not_seen():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        chance = _passage(rng.uniform(-1.1, 1.1, (2, METRO.axles.size)))
+        assert chance._in_place < IN_PLACE / 3
+        assert not chance.confirmed
