@@ -9,10 +9,11 @@ from scipy import fft
 from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
 from trackvib_ros.detection.blind import Blind
-from trackvib_ros.detection.bowl import corner, low_pass
+from trackvib_ros.detection.bowl import _LOADS, _STRENGTHS, _odds, corner, low_pass
 from trackvib_ros.detection.kinematics import Motion
 from trackvib_ros.detection.place import Wave
-from trackvib_ros.detection.single import bogies
+from trackvib_ros.detection.single import Shown, _likeliest, _Trial, bogies
+from trackvib_ros.detection.wheelsets import Wheelsets
 
 STEP = 0.001
 CAR = np.array([0.0, 2.5, 17.5, 20.0])
@@ -117,3 +118,41 @@ def test_bogies_are_seen_whatever_the_speed(speed):
     assert stand.speeds()[0] == pytest.approx(speed)
     even = bogies(np.arange(24) / speed)  # what is evenly spaced has none
     assert not even.clear
+
+
+def test_evidence_of_loads_is_that_of_their_gaussian_process():
+    rng = np.random.default_rng(4)
+    x = rng.standard_normal((40, 5))
+    y = x @ rng.normal(1.0, 0.3, 5) + 0.8 * rng.standard_normal(40)
+    covariance = x @ (np.ones((5, 5)) + _LOADS**2 * np.eye(5)) @ x.T
+    logs = []
+    for g in _STRENGTHS:
+        c = np.eye(40) + g * covariance
+        misfit = y @ np.linalg.solve(c, y) / (y @ y)
+        logs.append(-20 * np.log(misfit) - 0.5 * np.linalg.slogdet(c)[1])
+    assert _odds(x, y, 40.0) == pytest.approx(max(logs), rel=1e-9)
+
+
+def test_short_waves_at_every_wheelset_are_no_faster_train():
+    """Roughness that shakes every wheelset alike has pulses of its own, three for each."""
+    speed, wavelength = 35.0, 0.5
+    wave = bowls(1.8, speed, 0.05, np.random.default_rng(5))
+    passed = 1.0 + PLACES / speed
+    away = speed * (wave.time[:, None] - passed)
+    shaken = np.cos(2 * np.pi * away / wavelength) * np.exp(-0.5 * (away / 0.4) ** 2)
+    wave = replace(wave, value=wave.value + shaken.sum(axis=1))
+    thrice = np.sort((passed[:, None] + wavelength / speed * np.arange(-1, 2)).ravel())
+
+    def trial(speed, times):
+        n = times.size
+        found = Wheelsets(times, np.ones(n), np.full(n, 0.02), 8.0, 1.0, 0.9, np.ones(3))
+        return _Trial(speed, found, times, True, bogies(times))
+
+    slow, fast = trial(speed, passed), trial(3 * speed, thrice)
+    assert slow.bogies.clear and fast.bogies.clear
+    span = float(passed[0]) - 0.2, float(passed[-1]) + 0.2
+    shown = Shown(None, span, span, (10.0, 120.0), None, 0)
+    shown.__dict__["wave"] = wave
+    # in its own waves the faster train explains more than the slower one in those that it has
+    assert fast.worth(shown, fast.likely) > slow.worth(shown, slow.likely)
+    assert _likeliest(shown, [fast, slow])[0] is slow

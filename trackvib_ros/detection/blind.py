@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import travel
+from .bowl import WAVENUMBER, corner
 from .calibration import Calibration
 from .kinematics import Motion
 from .place import Wave, likelihood, locate
 from .record import Record
-from .single import HUMP, HUMP_FINE, Shown, alone, compared, log_energy
+from .single import HUMP, HUMP_FINE, Shown, alone, log_energy
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -32,6 +33,7 @@ _PAIRED = 0.7  # share of the wheelsets that have one, when wheelsets and not bo
 _LEAST_BOGIES, _LEAST_WHEELSETS = 3, 4  # a delay fits any two coincidences
 _LEAST_WORTH = 25.0  # e^25 outweighs the speeds and pulses tried, as for two channels
 _LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right than wrong
+_AMONG = (2.0, 60.0)  # Hz, in which those of a type are compared with others
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
 _BOGIE = 2  # wheelsets
 _SHOWN = 0.9  # of the two metres about a wheelset, to be measured
@@ -112,7 +114,8 @@ class Blind:
         cost = 0.5 * float(np.log(both.size))
 
         def gain(at: Array) -> float:
-            fine = compared(wave, motion.time_at(at), motion.speed, (float(first), float(last)))
+            span, guess = (float(first), float(last)), WAVENUMBER * motion.speed
+            fine = corner(wave, motion.time_at(at), guess, _AMONG, refits=0, span=span)
             return -np.inf if fine is None else fine.gain
 
         if max(more, fewer) < _BOGIE or gain(every) < 2 * cost * every.size:
@@ -331,7 +334,7 @@ def describe_alone(shown: Shown) -> Blind | None:
         # what clipping leaves of a deflection has another width
         travels=found.corner is not None
         and not shown.wave.clipped
-        and found.corner.worth(2) > _LEAST_WORTH
+        and found.worth > _LEAST_WORTH
         and found.certainty > _LIKELY
         and found.bogies.clear
         and found.times.size >= 2 * _LEAST_WHEELSETS,

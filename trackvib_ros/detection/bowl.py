@@ -36,6 +36,8 @@ SHAPE_SIGMA = 0.04
 found with it: the foundation is discrete and damped, and neighbours in a bogie share their bowls
 (computed passages of all types at 40 dB; 0.02 at the true places)."""
 
+_LOADS = 0.3  # relative, spread of the loads of a train: locomotives 21 t, coaches 12 t
+_STRENGTHS = np.geomspace(1e-4, 1e6, 61)  # of the mean pulse over the noise, squared
 _BAND = (0.4, 2.6)  # of the corner, where the bowl lies; shorter waves are roughness
 _TAPER = 8.0  # m beyond the outer wheelsets
 _PAD_S = 0.3  # s, the same where bands are compared
@@ -57,7 +59,9 @@ class Corner:
         value: its estimate.
         sigma: relative standard deviation, noise and roughness of this passage only.
         explained: part of the low-passed waveform that the pulses explain.
-        gain: ln of the likelihood ratio of the pulses to white noise.
+        gain: ln of the likelihood ratio of the pulses, with any loads, to white noise.
+        odds: the same with loads as those of a train, their prior integrated out.
+        data: independent values that were explained.
         times: of the wheelsets (s), and their standard deviations.
     """
 
@@ -65,12 +69,25 @@ class Corner:
     sigma: float
     explained: float
     gain: float
+    odds: float
+    data: float
     times: Array
     time_sigma: Array
 
-    def worth(self, unknowns: int) -> float:
-        """The gain less half ln n for every unknown of a wheelset (Bayesian information)."""
-        return self.gain - 0.5 * unknowns * self.times.size * float(np.log(self.times.size))
+    def worth(self, placed: bool) -> float:
+        """ln of the odds that these wheelsets are here and not only noise.
+
+        Places that were found in the same waveform cost half ln n of n data each (Bayesian
+        information).
+        """
+        cost = 0.5 * self.times.size * float(np.log(max(self.data, 1.0)))
+        return self.odds - (cost if placed else 0.0)
+
+
+def waves(speed: float) -> tuple[float, float]:
+    """Frequencies (Hz) in which the bowl of a train of a speed (m/s) lies on a typical rail."""
+    corner = WAVENUMBER * speed / (2 * np.pi)
+    return _BAND[0] * corner, _BAND[1] * corner
 
 
 def low_pass(f: Array, step: float) -> Array:
@@ -93,7 +110,8 @@ def corner(
         wave: low-passed waveform of the channel.
         times: of the wheelsets (s).
         guess: of the corner (rad/s).
-        band: frequencies compared (Hz); those of the guess by default.
+        band: frequencies that are explained (Hz), as far as they are on record; those of the guess
+            by default.
         refits: how often the times are improved.
         span: of the waveform that is explained, but for margins (s); that of the wheelsets by
             default.
@@ -117,10 +135,8 @@ def corner(
     size = int(fft.next_fast_len(4 * time.size // 3, real=True))
     f = fft.rfftfreq(size, step)
     seen = fft.rfft(value, size) * np.exp(-2j * np.pi * f * (time[0] - times[0]))
-    low, high = band or (
-        _BAND[0] * guess / (2 * np.pi),
-        min(_BAND[1] * guess / (2 * np.pi), LOW_TOP, 0.4 / step),
-    )
+    low, high = band or waves(guess / WAVENUMBER)
+    high = min(high, LOW_TOP, 0.4 / step)
     use = (f > low) & (f < high)
     if use.sum() < 8:
         return None
@@ -215,11 +231,34 @@ def corner(
     ) / (4 * np.outer(_STEPS, _STEPS))
     spread = float(np.linalg.pinv(hessian)[0, 0])
     share = explained(top, turned)
+    scale = float(np.sqrt(2 * independent / y.size))
+    odds = _odds(scale * real(pulses(top, turned)), scale * y, 2 * independent)
     return Corner(
         value=guess * float(np.exp(top[0])),
         sigma=float(np.sqrt(spread)) if spread > 0 else _LN_REACH,
         explained=share,
         gain=-independent * float(np.log(max(1 - share, _LEAST_LEFT))),
+        odds=odds,
+        data=2 * independent,
         times=at + float(top[2]) / guess,
         time_sigma=sigma,
     )
+
+
+def _odds(columns: Array, y: Array, data: float) -> float:
+    """ln of the evidence of loads of one mean and their spread against white noise.
+
+    With y = X q + noise and q of covariance g (1 1' + spread² I) it is, up to the level of noise
+    that fits best, -n/2 ln(y' C^-1 y / y' y) - 1/2 ln det C, C = I + X cov(q) X' (Rasmussen &
+    Williams, Gaussian Processes for Machine Learning, 2006, eq. 2.30); g is that which fits best.
+    """
+    n = columns.shape[1]
+    root = _LOADS * np.eye(n) + (np.sqrt(_LOADS**2 + n) - _LOADS) / n * np.ones((n, n))
+    x = columns @ root
+    values, vectors = np.linalg.eigh(x.T @ x)
+    values = np.maximum(values, 0.0)
+    along = (vectors.T @ (x.T @ y)) ** 2
+    g = _STRENGTHS[:, None]
+    left = 1 - np.sum(g * along / (1 + g * values), axis=1) / float(y @ y)
+    log = -0.5 * data * np.log(np.maximum(left, _LEAST_LEFT))
+    return float(np.max(log - 0.5 * np.sum(np.log1p(g * values), axis=1)))

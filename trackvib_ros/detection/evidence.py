@@ -118,6 +118,17 @@ def _classes(places: Array) -> NDArray[np.int64]:
     return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
+def _lean(places: Array) -> Array:
+    """Which side of every wheelset's bogie the nearer other bogie is on: 1 before, -1 behind, 0."""
+    gaps = np.diff(places)
+    bogie = np.concatenate([[0], np.cumsum(gaps > _NEAR)])
+    between = np.concatenate([[np.inf], gaps[gaps > _NEAR], [np.inf]])
+    before, behind = between[:-1], between[1:]
+    nearer = np.minimum(before, behind) < _FAR
+    lean = np.where(nearer & (np.abs(before - behind) > _ALIKE), np.sign(behind - before), 0.0)
+    return np.asarray(lean[bogie])
+
+
 def _noise(candidate: Candidate) -> float:
     """Scatter of wheelsets of one class about their median (m), outliers limited."""
     classes = _classes(candidate.places)
@@ -276,6 +287,9 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
             share = (classes == k) - np.mean(classes == k)
             for row in np.eye(channels):
                 base.append(_CLASS_SIGMA * np.outer(row, share))
+        lean = _lean(c.places)
+        for row in np.eye(channels):
+            base.append(_CLASS_SIGMA * np.outer(row, lean - np.mean(lean)))
         # the noise is in the times: effects that grow along the train must follow fitted places,
         # or a train of free size shrinks to lessen its noise
         noisy = np.where(c.fit.observed, c.fit.residual, 0.0)

@@ -35,6 +35,8 @@ UNLIKE = 0.33
 that of listed trains on one channel is -3.4 ± 0.9 (computed passages of 0 to 40 dB), of unlisted
 ones -1.0 ± 0.5, and these are one in twenty."""
 
+_SCATTER = ((-3.4, 0.9, 0.95), (-1.0, 0.5, 0.05))  # of listed and unlisted trains, as above
+
 SEEN = 0.5
 """ln of energy (2 dB) by which a wheelset that is seen rises over what is beside it."""
 
@@ -141,6 +143,17 @@ class Passage:
     def alone(self) -> bool:
         """Whether one channel shows it."""
         return self.direction == 0 and len(self.traces) == 1
+
+    @property
+    def unlike(self) -> float:
+        """Probability that a type is a relative's, by what wheelsets on one channel scatter about
+        its places; 0 where the deflection or a second channel shows these."""
+        best = self.hypotheses[0]
+        if not self.alone or best.phase > IN_PHASE:
+            return 0.0
+        at = np.log(max(best.fit.scale, 1e-3))
+        listed, other = (p / s * np.exp(-0.5 * ((at - m) / s) ** 2) for m, s, p in _SCATTER)
+        return float(other / (listed + other))
 
     def _doubted(self, scatter: float) -> bool:
         """Whether wheelsets scatter by more than this (m) and no deflection shows the type."""

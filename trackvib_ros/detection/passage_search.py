@@ -131,7 +131,7 @@ def bowl_of(record: Record, passage: Passage) -> Corner | None:
     times = motion.time_at(best.places + apart)
     found = corner(wave, times, WAVENUMBER * motion.speed)
     found = found and corner(wave, found.times, found.value)
-    return found if found is not None and found.worth(2) > 0 else None
+    return found if found is not None and found.worth(placed=True) > 0 else None
 
 
 def _described(

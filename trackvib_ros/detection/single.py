@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from . import travel
-from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD, Corner, corner, low_pass
+from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD, Corner, corner, low_pass, waves
 from .kinematics import PRIOR_ACCELERATION, Motion
 from .pattern import Trace
 from .place import Wave
@@ -60,7 +60,6 @@ _TRIALS = 6  # speeds at which wheelsets are looked for
 _APART = 1.2  # ratio of different trials
 _LEVELS = (0.3, 0.5, 0.7, 1.0)
 _ROUGHNESS = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the bowl's highest density
-_AMONG = (2.0, 60.0)  # Hz, in which trials are compared
 _SAME_GAP = 0.06  # of a wheelbase, between bogies of one build
 _BOGIE = 1.4  # wheelbases, beyond which the next wheelset is of another bogie
 _BASES = (1.5, 3.6)  # m, wheelbases that exist, by a bowl that is good to a fifth
@@ -159,6 +158,7 @@ class Single:
         certainty: probability that their number is right.
         contrast: typical pulse over the noise of its estimate.
         corner: of the deflection; ``None`` if it was not seen.
+        worth: ln of odds that the deflection shows these wheelsets and not only noise.
         bogies: how the wheelsets stand.
         method: what the scale is from.
     """
@@ -170,6 +170,7 @@ class Single:
     certainty: float
     contrast: float
     corner: Corner | None
+    worth: float
     bogies: Bogies
     method: str
 
@@ -225,34 +226,60 @@ def _seen(signal: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
 
 @dataclass(frozen=True)
 class _Trial:
-    """Wheelsets found at one trial speed (m/s), in the deflection or in energies."""
+    """Wheelsets found at one trial speed (m/s), in the deflection or in energies.
+
+    Attributes:
+        times: of the wheelsets (s).
+        placed: whether they are where the deflection has pulses.
+    """
 
     speed: float
     found: Wheelsets
     times: Array
-    corner: Corner | None
-    gain: float
+    placed: bool
     bogies: Bogies
 
     @property
-    def rank(self) -> tuple[int, float]:
-        """Wheelsets in bogies, whose number is likely, before others; then what they explain."""
-        return 2 * self.bogies.clear + (self.found.certainty > 0.5), self.gain
+    def likely(self) -> float:
+        """The speed (m/s) that the wheelbase means, or at which they were found without any."""
+        return next(iter(self.bogies.speeds()), self.speed)
+
+    def worth(self, shown: Shown, slowest: float) -> float:
+        """ln of odds that its wheelsets are there, by the waves of a train of a speed (m/s)."""
+        fine = explained(shown, self.times, self.likely, slowest)
+        return -np.inf if fine is None else fine.worth(self.placed)
 
 
-def compared(
-    wave: Wave, times: Array, speed: float, span: tuple[float, float] | None = None
-) -> Corner | None:
-    """What wheelsets (s), each with a load of its own, explain of the deflection at about a speed
-    (m/s), in a band that is the same for all: of one span (s), their gains can be compared."""
-    return corner(wave, times, WAVENUMBER * speed, _AMONG, refits=0, span=span)
+def explained(shown: Shown, times: Array, speed: float, slowest: float) -> Corner | None:
+    """What wheelsets (s) explain of the deflection at about a speed (m/s).
+
+    All of the event is asked for the waves of a train of the speed ``slowest`` (m/s); at one of
+    these speeds several sets of wheelsets can be compared.
+    """
+    guess = WAVENUMBER * speed
+    return corner(shown.wave, times, guess, waves(slowest), refits=0, span=shown.interval)
 
 
-def _weighed(shown: Shown, speed: float, found: Wheelsets, times: Array, unknowns: int) -> _Trial:
-    """A trial with what its wheelsets, of so many unknowns each, explain of the deflection."""
-    fine = compared(shown.wave, times, speed)
-    gain = -np.inf if fine is None else fine.worth(unknowns)
-    return _Trial(speed, found, times, fine, gain, bogies(times))
+def _likeliest(shown: Shown, trials: Sequence[_Trial]) -> tuple[_Trial, float]:
+    """The trial whose wheelsets explain the bowls best, and what its wheelsets are worth.
+
+    Roughness shakes a rail in waves shorter than its bowl, again at every wheelset; pulses in step
+    with these explain more of a waveform than its wheelsets do, as those of a faster train. So all
+    are compared by the waves of the slowest one that has bogies and bowls: wheelsets of a faster
+    train explain these as well, and shorter ones may be roughness.
+    """
+    own = alone = [trial.worth(shown, trial.likely) for trial in trials]
+    bowls = [t for t, worth in zip(trials, own, strict=True) if t.bogies.clear and worth > 0]
+    if len(bowls) > 1:
+        slowest = min(trial.likely for trial in bowls)
+        own = [trial.worth(shown, slowest) for trial in trials]
+
+    def rank(k: int) -> tuple[int, float]:
+        # wheelsets in bogies, whose number is likely, before others
+        return 2 * trials[k].bogies.clear + (trials[k].found.certainty > 0.5), own[k]
+
+    best = max(range(len(trials)), key=rank)
+    return trials[best], alone[best]
 
 
 def _deflected(shown: Shown, speeds: Sequence[float]) -> tuple[list[_Trial], bool]:
@@ -275,9 +302,10 @@ def _deflected(shown: Shown, speeds: Sequence[float]) -> tuple[list[_Trial], boo
         out.append(trial)
         good = trial.found.certainty > _SURE and trial.found.explained > _ALL * possible
         settled = any(abs(np.log(speed / v)) < np.log(_SETTLED) for v in trial.bogies.speeds())
-        if good and settled and trial.gain > 0:
+        fine = explained(shown, trial.times, trial.likely, trial.likely)
+        if good and settled and fine is not None and fine.worth(placed=True) > 0:
             return out, True
-        by_bowl = [] if trial.corner is None else [trial.corner.value / shown.bowl[0]]
+        by_bowl = [] if fine is None else [fine.value / shown.bowl[0]]
         queue = trial.bogies.speeds() + by_bowl + queue
     return out, False
 
@@ -298,7 +326,7 @@ def _pulses(shown: Shown, speed: float) -> tuple[_Trial | None, float]:
     if found is None or found.place.size < _LEAST_WHEELSETS:
         return None, possible
     times = edges[0] + (found.place + 0.5 * travel.CELL) / speed
-    return _weighed(shown, speed, found, times, 2), possible
+    return _Trial(speed, found, times, True, bogies(times)), possible
 
 
 def _energetic(shown: Shown, speeds: Sequence[float]) -> list[_Trial]:
@@ -318,7 +346,7 @@ def _energetic(shown: Shown, speeds: Sequence[float]) -> list[_Trial]:
         found = find(cells, noise, hump)
         if found is not None and found.place.size >= _LEAST_WHEELSETS:
             times = edges[0] + (found.place + 0.5 * travel.CELL) / speed
-            out.append(_weighed(shown, speed, found, times, 1))
+            out.append(_Trial(speed, found, times, False, bogies(times)))
     return out
 
 
@@ -396,7 +424,7 @@ def alone(shown: Shown) -> Single | None:
         trials += _energetic(shown, speeds[:_ENERGETIC])
     if not trials:
         return None
-    best = max(trials, key=lambda trial: trial.rank)
+    best, worth = _likeliest(shown, trials)
     fine = _bowl(shown, best)
     limits = (shown.limits[0], shown.top)
     if fine is not None:
@@ -415,7 +443,7 @@ def alone(shown: Shown) -> Single | None:
         return None
     place = float(np.median(best.found.sigma)) * speed[0] / best.speed
     times = best.times if fine is None else fine.times
-    return _result(times, place, speed, best.found, fine, stand, method)
+    return _result(times, place, speed, best.found, fine, worth, stand, method)
 
 
 def _bowl(shown: Shown, best: _Trial) -> Corner | None:
@@ -424,8 +452,6 @@ def _bowl(shown: Shown, best: _Trial) -> Corner | None:
     Waves shorter than the bowl, of roughness and sleepers, have a corner of their own: it is looked
     for about the speeds that the wheelbase allows, the nearest to what is known of the site kept.
     """
-    if best.corner is None:
-        return None
     spread = float(np.hypot(shown.bowl[1], SHAPE_SIGMA))
     found: list[tuple[float, Corner]] = []
     for (share, _, _), speed in zip(
@@ -443,10 +469,10 @@ def _bowl(shown: Shown, best: _Trial) -> Corner | None:
 def _refined(wave: Wave, times: Array, first: float) -> Corner | None:
     """The corner about a first guess (rad/s), with places and loads of all wheelsets, or with the
     loads alone at the places that were found."""
-    for unknowns in (2, 1):
-        trial = corner(wave, times, first, refits=unknowns - 1)
-        trial = trial and corner(wave, trial.times, trial.value, refits=unknowns - 1)
-        if trial is not None and trial.worth(unknowns) > 0:
+    for refits in (1, 0):
+        trial = corner(wave, times, first, refits=refits)
+        trial = trial and corner(wave, trial.times, trial.value, refits=refits)
+        if trial is not None and trial.worth(placed=refits > 0) > 0:
             return trial
     return None
 
@@ -457,6 +483,7 @@ def _result(
     speed: tuple[float, float, tuple[float, float]],
     found: Wheelsets,
     fine: Corner | None,
+    worth: float,
     stand: Bogies,
     method: str,
 ) -> Single:
@@ -472,6 +499,7 @@ def _result(
         certainty=found.certainty,
         contrast=found.contrast,
         corner=fine,
+        worth=worth,
         bogies=stand,
         method=method,
     )

@@ -67,6 +67,11 @@ def speed(passage: Passage) -> Speed:
     held = _held(passage)
     if passage.known:
         meant = [part(h.probability, h.fit.motion) for h in held]
+        # by what wheelsets scatter it may be a train of which only the proportions are listed
+        if (unlike := passage.unlike) > 0:
+            parts = [(w * (1 - unlike), v, s) for w, v, s in parts] + [
+                (w * unlike, v, float(np.hypot(s, _SIZE * v))) for w, v, s in parts
+            ]
     else:
         related = ("scaled", "varied")
         meant = [part(e.probability, e.motion) for e in passage.explanations if e.kind in related]
