@@ -43,6 +43,7 @@ LISTED: tuple[Kind, ...] = ("type", "moved", "clock")
 # m, at every channel wheelsets with other neighbours have other pulses: on computed passages at 20
 # and 40 dB rms 0.012 m, one in twenty beyond 0.03 m; more where noise hides a pulse
 _CLASS_SIGMA = 0.03
+_LEAN_SIGMA = 0.012  # m, the same of both wheelsets of a bogie: the rms of them all
 _ALIKE = 0.1  # m, gaps that differ by less are the same
 _FAR = 12.0  # m, neighbours that do not matter
 _LEAST_NOISE = 0.005  # m, a wheelset is timed in cells of 0.1 m: finer agreement is chance
@@ -289,7 +290,7 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
                 base.append(_CLASS_SIGMA * np.outer(row, share))
         lean = _lean(c.places)
         for row in np.eye(channels):
-            base.append(_CLASS_SIGMA * np.outer(row, lean - np.mean(lean)))
+            base.append(_LEAN_SIGMA * np.outer(row, lean - np.mean(lean)))
         # the noise is in the times: effects that grow along the train must follow fitted places,
         # or a train of free size shrinks to lessen its noise
         noisy = np.where(c.fit.observed, c.fit.residual, 0.0)
