@@ -30,8 +30,8 @@ def candidate(
     zeros = np.zeros(time.shape)
     residual = zeros.copy()
     residual[seen] = fit.residual
-    sigma = np.full(channels, place)
-    axle_fit = AxleFit(fit.motion, fit.scale, time, residual, zeros, seen, fit.offset, sigma)
+    placed = place**2 * np.eye(channels)
+    axle_fit = AxleFit(fit.motion, fit.scale, time, residual, zeros, seen, fit.offset, placed)
     free = site**2 * (np.eye(channels) + 1.0)
     free[0] = free[:, 0] = 0.0
     return Candidate(nominal, shifts, axle_fit, 0.9, free)

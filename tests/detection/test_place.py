@@ -36,12 +36,18 @@ def wave(
     return Wave(time, value, np.ones(time.size, dtype=bool)), motion
 
 
+def placed(tables, scales):
+    """Shifts of the channels and their standard deviations (m)."""
+    shift, covariance = locate(tables, scales)
+    return shift, np.sqrt(np.diag(covariance))
+
+
 @pytest.mark.parametrize("speed", [12.0, 30.0, 90.0])
 @pytest.mark.parametrize("acceleration", [0.0, 0.3])
 def test_a_clean_pulse_is_placed_within_a_centimetre(speed, acceleration):
     for beta in (0.8, 1.3):  # soft and stiff pads: k0 = 2**0.5 beta
         given, motion = wave(speed, 0.37, 0.0, 0, beta, sign=-1.0, acceleration=acceleration)
-        shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.5]))
+        shift, sigma = placed([likelihood(given, motion, AXLES)], np.array([0.5]))
         # the unknown coupling may lead by half of what its mean edge of 1.5 Hz would do
         assert abs(shift[0] - 0.37) < 0.01 + 0.02 * 12.0 / speed
         assert sigma[0] < 0.03
@@ -51,14 +57,14 @@ def test_a_clean_pulse_is_placed_within_a_centimetre(speed, acceleration):
 def test_a_channel_is_placed_though_its_energies_are_most_of_a_wheelbase_off(error):
     for seed in range(4):
         given, motion = wave(45.0, error, 1.0, seed)
-        shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.07]))
+        shift, sigma = placed([likelihood(given, motion, AXLES)], np.array([0.07]))
         # the deflection of the next wave, 1.2 m off, was told for it where the search ended
         assert abs(shift[0] - error) < 3 * sigma[0] < 0.15
 
 
 def test_the_lead_of_an_ac_coupling_is_taken_out():
     given, motion = wave(16.0, 0.0, 0.02, 0, coupling=2.0)
-    shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.5]))
+    shift, sigma = placed([likelihood(given, motion, AXLES)], np.array([0.5]))
     # at 3 m of wavelength 2 Hz lead by atan(2 / 5.3) x 3 m / 2 pi = 0.17 m
     assert abs(shift[0]) < 2 * sigma[0] < 0.08
 
@@ -69,10 +75,29 @@ def test_stated_sigma_holds_in_noise():
         rng = np.random.default_rng(1000 + seed)
         error, speed = rng.uniform(-0.4, 0.4), rng.uniform(15.0, 90.0)
         given, motion = wave(speed, error, rng.uniform(0.5, 4.0), seed, coupling=1.0)
-        shift, sigma = locate([likelihood(given, motion, AXLES)], np.array([0.5]))
+        shift, sigma = placed([likelihood(given, motion, AXLES)], np.array([0.5]))
         ratios.append((shift[0] - error) / sigma[0])
     # 60 draws: the rms of unit normals lies within 1 +- 3 / sqrt(120)
     assert 0.73 < np.sqrt(np.mean(np.square(ratios))) < 1.27
+
+
+def test_what_the_coupling_leaves_in_doubt_is_no_part_of_a_distance():
+    """Two channels before the same coupling, of unknown edge, on their way to one distance."""
+    ratios, single = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(5000 + seed)
+        errors, speed = rng.uniform(-0.2, 0.2, 2), rng.uniform(10.0, 40.0)
+        noise, coupling = rng.uniform(0.05, 1.0), rng.uniform(0.5, 2.5)
+        given = [wave(speed, e, noise, 2 * seed + k, 1.0, coupling) for k, e in enumerate(errors)]
+        tables = [likelihood(one, motion, AXLES) for one, motion in given]
+        shift, covariance = locate(tables, np.full(2, 0.5))
+        apart = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+        ratios.append((np.diff(shift)[0] - np.diff(errors)[0]) / np.sqrt(apart))
+        single.append(np.sqrt(apart / (covariance[0, 0] + covariance[1, 1])))
+    # 40 draws: the rms of unit normals lies within 1 +- 3 / sqrt(80)
+    assert 0.66 < np.sqrt(np.mean(np.square(ratios))) < 1.34
+    # more than half of the variance of either place is common to both
+    assert np.median(single) ** 2 < 0.5
 
 
 def test_noise_alone_tells_nothing():
@@ -80,7 +105,7 @@ def test_noise_alone_tells_nothing():
     time = np.arange(0.0, 12.0, 1 / RATE)
     empty = Wave(time, rng.standard_normal(time.size), np.ones(time.size, dtype=bool))
     motion = Motion(4.0, 0.0, 30.0, 0.0, np.eye(3))
-    _, sigma = locate([likelihood(empty, motion, AXLES)], np.array([0.5]))
+    _, sigma = placed([likelihood(empty, motion, AXLES)], np.array([0.5]))
     assert sigma[0] > 0.3
 
 
@@ -88,7 +113,7 @@ def test_a_channel_without_samples_keeps_its_prior():
     given, motion = wave(30.0, 0.3, 0.1, 0)
     silent = Wave(given.time, given.value, np.zeros(given.time.size, dtype=bool))
     tables = [likelihood(given, motion, AXLES), likelihood(silent, motion, AXLES)]
-    shift, sigma = locate(tables, np.array([0.5, 0.07]))
+    shift, sigma = placed(tables, np.array([0.5, 0.07]))
     assert shift == pytest.approx([0.3, 0.0], abs=0.02)
     assert sigma[0] < 0.05 and 0.1 < sigma[1] < 0.25
 

@@ -42,8 +42,8 @@ class AxleFit:
 
     Arrays have shape (channels, wheelsets): time (s), residual (m, channel offset
     removed), contrast (ln of the energy at
-    the wheelset over that beside it), observed. ``place_sigma`` is how well the pulses of each
-    channel tell where the wheelsets are (m); their spacing is known far better.
+    the wheelset over that beside it), observed. ``place`` is the covariance (m²) of where the
+    pulses of every channel tell the wheelsets to be; their spacing is known far better.
     ``in_phase`` is the ln of the likelihood that their deflections are there, if these placed them.
     """
 
@@ -54,13 +54,17 @@ class AxleFit:
     contrast: Array
     observed: NDArray[np.bool_]
     offset: Array
-    place_sigma: Array
+    place: Array
     in_phase: float = 0.0
 
     @property
     def used(self) -> NDArray[np.bool_]:
         """Wheelsets that agree with the motion within four standard deviations."""
         return self.observed & (np.abs(self.residual) < 4 * self.scale)
+
+    def apart(self, a: int, b: int) -> float:
+        """Variance (m²) of the distance between two channels by their pulses."""
+        return float(self.place[a, a] + self.place[b, b] - 2 * self.place[a, b])
 
 
 def _neighbours(axles: Array) -> NDArray[np.int64]:
@@ -213,10 +217,10 @@ def _by_deflection(
     return time, fit.motion, found.gain
 
 
-def _position(place_sigma: Array) -> float:
+def _position(place: Array) -> float:
     """How far a channel may be from its place (m): free where deflections told it, to be judged
     with the distances between the channels."""
-    placed = float(np.max(place_sigma)) < PULSE_PLACE_SIGMA
+    placed = float(np.max(np.diag(place))) < PULSE_PLACE_SIGMA**2
     return _FREE_POSITION if placed else PULSE_PLACE_SIGMA
 
 
@@ -233,7 +237,7 @@ def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
         np.stack(list(places))[seen],
         np.nonzero(seen)[0],
         fit.motion.epoch,
-        position_sigma=_position(fit.place_sigma),
+        position_sigma=_position(fit.place),
     )
     residual = np.zeros(seen.shape)
     residual[seen] = again.residual
@@ -310,7 +314,7 @@ def fit_axles(
         if motion.speed < 1.0:
             fit = None
             break
-    place_sigma = np.full(len(traces), np.inf)
+    place = np.diag(np.full(len(traces), np.inf))
     residual = np.zeros(shape)
     bent, in_phase = None, 0.0
     if fit is not None and fit.scale > _CLOSE:
@@ -336,15 +340,15 @@ def fit_axles(
             seen = observed[k] if observed[k].any() else slice(None)
             late = float(np.median(((time[k] - due[k]) * pace[k])[seen]))
             tables.append(likelihood(waves[k], motion, places[k] + late))
-        more, place_sigma = locate(tables, scales)
-        place_sigma[[wave.clipped for wave in waves]] += CLIPPED_SIGMA
+        more, place = locate(tables, scales)
+        place += np.diag([CLIPPED_SIGMA**2 if wave.clipped else 0.0 for wave in waves])
         time += more[:, None] / pace
         fit = regress(
             time[observed],
             np.stack(list(places))[observed],
             channel,
             motion.epoch,
-            position_sigma=_position(place_sigma),
+            position_sigma=_position(place),
         )
         residual[observed] = fit.residual
     return AxleFit(
@@ -355,6 +359,6 @@ def fit_axles(
         contrast=contrast,
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
-        place_sigma=place_sigma,
+        place=place,
         in_phase=in_phase,
     )

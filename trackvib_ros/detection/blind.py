@@ -37,7 +37,7 @@ _AMONG = (2.0, 60.0)  # Hz, in which those of a type are compared with others
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
 _BOGIE = 2  # wheelsets
 _SHOWN = 0.9  # of the two metres about a wheelset, to be measured
-_CARRIED = 4.0  # m, strong energy before the first wheelset and behind the last (0 to 3.4 m)
+_SHAPE = 0.03  # m, of both wheelsets of a bogie against each other: by the shape of their pulse
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
 
@@ -179,16 +179,18 @@ def at_site(blind: Blind, site: Calibration) -> Blind:
 def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
     """With the doubt that wheelsets before the first or after the last one were missed.
 
-    Strong energy that no wheelset explains is one that was missed; where the number of wheelsets
-    is in doubt, that which the rail carries is one too.
+    Strong energy that no wheelset explains is one that was missed, if it lasts for longer than the
+    longest gap of the train. Where the number of wheelsets is in doubt, that which the rail carries
+    is one too, and one beyond the strong energy may be none.
     """
-    carried = _CARRIED / blind.speed[0] if blind.regular >= CONFIDENT else 0.0
+    carried = float(np.max(np.diff(blind.times))) if blind.regular >= CONFIDENT else 0.0
     sigma = blind.time_sigma.copy()
     for k, missed in (
         (0, float(blind.times[0]) - interval[0]),
         (-1, interval[1] - float(blind.times[-1])),
     ):
-        sigma[k] = np.hypot(sigma[k], missed if missed > carried else 0.0)
+        doubt = missed if blind.regular >= CONFIDENT else abs(missed)
+        sigma[k] = np.hypot(sigma[k], doubt if doubt > carried else 0.0)
     return replace(blind, time_sigma=sigma)
 
 
@@ -259,7 +261,8 @@ def _two_channels(
         motion=motion,
         speed=(speed, motion.speed_sigma(middle)),
         times=times,
-        time_sigma=np.hypot(wheelsets.sigma, place_sigma) / motion.speed_at(times),
+        time_sigma=np.sqrt(wheelsets.sigma**2 + place_sigma**2 + _SHAPE**2)
+        / motion.speed_at(times),
         # bogies further apart than wheelsets are: one pulse for both wheelsets of a bogie
         regular=wheelsets.certainty if paired.mean() > _PAIRED else min(wheelsets.certainty, 0.5),
         direction=found.direction,
@@ -267,7 +270,7 @@ def _two_channels(
         travels=_is_train(wheelsets.place[both], paired[both]),
         method="delay between two rail channels",
         axle_method="pulses common to two rail channels",
-        spacing_sigma=float(2**0.5 * np.median(wheelsets.sigma)),
+        spacing_sigma=float(np.hypot(2**0.5 * np.median(wheelsets.sigma), 2 * _SHAPE)),
         baseline=b.channel.x - a.channel.x,
     )
 
@@ -285,8 +288,8 @@ def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion,
         )
         for r, ahead in ((a, 0.0), (b, way * baseline))
     ]
-    shift, sigma = locate(tables, np.full(2, _PLACE))
-    relative = float(np.hypot(*sigma)) / baseline
+    shift, place = locate(tables, np.full(2, _PLACE))
+    relative = float(place[0, 0] + place[1, 1] - 2 * place[0, 1]) ** 0.5 / baseline
     if relative * motion.speed < motion.covariance[1, 1] ** 0.5:
         factor = baseline / (baseline + way * float(shift[1] - shift[0]))
         covariance = motion.covariance.copy()
@@ -298,8 +301,8 @@ def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion,
             motion.acceleration * factor,
             covariance,
         )
-        return motion, (places + shift[0]) * factor, float(sigma[0])
-    return motion, places + shift[0], float(sigma[0])
+        return motion, (places + shift[0]) * factor, float(place[0, 0]) ** 0.5
+    return motion, places + shift[0], float(place[0, 0]) ** 0.5
 
 
 def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:

@@ -275,11 +275,7 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
         use = c.fit.observed if common is None else c.fit.observed & common
         classes = _classes(c.places)
         base: list[Array] = []
-        for k in range(channels):
-            effect = np.zeros((channels, axles))
-            effect[k] = c.fit.place_sigma[k]
-            base.append(effect)
-        variances, directions = np.linalg.eigh(c.site)
+        variances, directions = np.linalg.eigh(c.fit.place + c.site)
         for variance, along_channels in zip(variances, directions.T, strict=True):
             if variance > 1e-12:
                 base.append(np.outer(np.sqrt(variance) * along_channels, np.ones(axles)))

@@ -182,9 +182,8 @@ def _measure(
         return None
     ahead = best.motion.distance_at(fit.time) - candidates[best.candidate].places
     shift = np.array([np.median(row[seen]) for row, seen in zip(ahead, fit.used, strict=True)])
-    variance = fit.place_sigma**2 + fit.scale**2 / fit.used.sum(axis=1)
-    covariance = np.diag(variance) + variance[0]
-    covariance[0] = covariance[:, 0] = 0.0
+    less = np.eye(len(names)) - np.eye(len(names))[0]  # of every channel, less the first
+    covariance = less @ (fit.place + np.diag(fit.scale**2 / fit.used.sum(axis=1))) @ less.T
     return Measured(names, direction * (shift - shift[0] - stated), covariance)
 
 
@@ -245,5 +244,5 @@ def delay_speed(passage: Passage) -> tuple[float, float] | None:
     mean = float(ratio[good].mean())
     sigma = max(float(ratio[good].std(ddof=1)), 1e-6) / np.sqrt(good.sum())
     speed = float(fit.motion.speed_at(best.mid_time)) / mean
-    baseline = float(np.hypot(*fit.place_sigma[[a, b]])) / (x[b] - x[a])
+    baseline = fit.apart(a, b) ** 0.5 / (x[b] - x[a])
     return speed, speed * float(np.hypot(sigma / mean, baseline))

@@ -36,9 +36,9 @@ REACH = 2.5
 
 _STEP = 0.1  # m
 _WAVENUMBERS = (1.0, 5.0)  # rad/m: shorter waves are roughness, longer ones the bridge and the cars
-_STIFFNESS = (1.4,)  # rad/m, k0 = (foundation / bending stiffness)^(1/4); 1.2 to 1.9 on ballastless
-# clipping flattens a pulse: any even one made of three, and what of it is left above
-_STIFFNESS_CLIPPED, _TOP_CLIPPED = (0.9, 1.4, 2.2), 7.0
+# rad/m, k0 = (foundation / bending stiffness)^(1/4), 1.2 to 1.9 on ballastless track; any even
+# pulse is made of three. What of a clipped one, which is flatter, is left above
+_STIFFNESS, _TOP_CLIPPED = (0.9, 1.4, 2.2), 7.0
 _TAPER = 8.0  # m beyond the outer wheelsets
 _COUPLINGS = np.arange(0.0, 3.01, 0.5)  # Hz, edges of the AC coupling of accelerometers
 _SHIFTS = np.arange(-REACH, REACH + 0.01, 0.02)
@@ -58,9 +58,10 @@ _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
 DEFLECTION_SIGMA = 0.003
 """What remains in doubt of a place found in this way (m), beside noise and the unknown coupling:
-rms difference of two channels, over 2**0.5, on 60 computed passages at 40 dB, 43 to 380 km/h. What
-damped pads make all deflections lag by (rms 0.005 m there) is hardly told from the lead of the
-coupling, and is in its posterior."""
+rms difference of two channels, over 2**0.5, on 60 computed passages at 40 dB, 43 to 380 km/h."""
+
+LAG_SIGMA = 0.005
+"""What damped pads make the deflections of all channels lag by (m, rms on the same passages)."""
 
 CLIPPED_SIGMA = 0.2
 """The same of a clipped channel (m): of 66 that were computed and cut at a fifth of their peak half
@@ -192,14 +193,13 @@ def likelihood(wave: Wave, motion: Motion, places: Array) -> Array:
         Zero everywhere if the channel shows nothing of the train.
     """
     flat = np.zeros((_COUPLINGS.size, _SHIFTS.size))
-    stiffness, top = (_STIFFNESS_CLIPPED, _TOP_CLIPPED) if wave.clipped else (_STIFFNESS, None)
-    found = spectrum(wave, motion, places, top)
+    found = spectrum(wave, motion, places, _TOP_CLIPPED if wave.clipped else None)
     if found is None:
         return flat
     k, seen, independent = found
     energy = float(np.sum(np.abs(seen) ** 2))
     comb = np.exp(-1j * np.outer(k, places - places[0])).sum(axis=1)
-    pulses = comb * k**2 / (1 + (k / np.array(stiffness)[:, None]) ** 4)
+    pulses = comb * k**2 / (1 + (k / np.array(_STIFFNESS)[:, None]) ** 4)
     frequency = k * _mid_speed(motion, places) / (2 * np.pi)
     turned = seen[:, None] * np.exp(1j * np.outer(k, _SHIFTS))
     for row, edge in zip(flat, _COUPLINGS, strict=True):
@@ -433,9 +433,10 @@ def _from(motion: Motion, start: float) -> Motion:
 
 
 def locate(tables: Sequence[Array], scales: Array) -> tuple[Array, Array]:
-    """Shift of every channel (m) and its standard deviation.
+    """Shift of every channel (m), and their covariance (m²).
 
-    The edge of the AC coupling is taken as the same at all channels.
+    The edge of the AC coupling is taken as the same at all channels: what it leaves in doubt, and
+    the lag of the pads, is common to them and no part of their differences.
 
     Args:
         tables: :func:`likelihood` per channel.
@@ -452,7 +453,9 @@ def locate(tables: Sequence[Array], scales: Array) -> tuple[Array, Array]:
         parts.append(density / (density.sum(axis=1, keepdims=True) + 1e-300))
     weight = np.exp(joint - joint.max())
     weight /= weight.sum()
-    densities = np.array([weight @ part for part in parts])
-    shift = densities @ _SHIFTS
-    variance = densities @ _SHIFTS**2 - shift**2
-    return shift, np.sqrt(np.maximum(variance, 0.0) + DEFLECTION_SIGMA**2)
+    mean = np.array([part @ _SHIFTS for part in parts])
+    variance = np.array([part @ _SHIFTS**2 for part in parts]) - mean**2
+    shift = mean @ weight
+    own = np.diag(np.maximum(variance @ weight, 0.0) + DEFLECTION_SIGMA**2)
+    common = (mean * weight) @ mean.T - np.outer(shift, shift) + LAG_SIGMA**2
+    return shift, own + common

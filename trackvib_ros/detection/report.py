@@ -435,7 +435,9 @@ def _unknown(
         quality = (*quality, "axle_count_not_confident")
     speed, sigma = blind.speed
     times = blind.times
-    time_sigma = np.hypot(blind.time_sigma, _PULSE_SIGMA_S)
+    # pulses of two channels are timed by their waveforms
+    bins = _PULSE_SIGMA_S if len(blind.sensors) == 1 else 0.0
+    time_sigma = np.hypot(blind.time_sigma, bins)
     axles = [
         TrainEvent(
             kind="axle",

@@ -167,4 +167,4 @@ def ends(passage: Passage, value: float) -> tuple[tuple[float, float], tuple[flo
 def _unknown_place(passage: Passage) -> float:
     """How well a wheelset of an unknown type is where its pulse is (m), whatever its size."""
     fit = passage.hypotheses[0].fit
-    return float(np.sqrt(fit.place_sigma[0] ** 2 + fit.scale**2 + _WHEELBASE**2))
+    return float(np.sqrt(fit.place[0, 0] + fit.scale**2 + _WHEELBASE**2))

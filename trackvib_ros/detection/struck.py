@@ -228,7 +228,7 @@ def _passage(
             contrast=np.zeros(time.shape),
             observed=np.zeros(time.shape, dtype=bool),
             offset=np.zeros(len(records)),
-            place_sigma=np.full(len(records), _PLACE),
+            place=_PLACE**2 * np.eye(len(records)),
             in_phase=0.5 * f.sigmas**2,
         )
         levels = independent(f.train.span) * len(records)

@@ -13,7 +13,7 @@ n independent samples with the correlation r.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,9 +26,9 @@ from .pattern import Integral, Trace
 
 Array = NDArray[np.float64]
 
-PLACE_SIGMA = 0.02
-"""Standard deviation (m) of the distance between two rail sensors as their deflections show it:
-rms 0.013 m on computed passages without noise to speak of, and a centimetre of the tape."""
+PLACE_SIGMA = 0.013
+"""Standard deviation (m) of the distance between two rail sensors as their deflections show it: rms
+on computed passages without noise to speak of. That of the distance itself is the site's."""
 
 ENERGY_PLACE_SIGMA = 0.25
 """The same by energies alone: rms 0.2 to 0.3 m on computed passages."""
@@ -42,6 +42,7 @@ _LONGEST = 2000.0  # m of train; a longer vibration is something slower, or none
 _LEAST_GAIN = 25.0  # e^25 outweighs the 10^6 motions tried, and one error in 10^4 passages
 _LEAST_CORRELATION = 0.5  # of the energies, which all trains show
 _CANDIDATES = 5  # speeds that are compared with all filters
+_CELLS, _WIDE = 6, 4.0  # either side of a mean, that hold a density; its standard deviations there
 _CLIP = 5.0  # rms, above which a sample of the waveform counts no more
 
 
@@ -365,6 +366,21 @@ def _parabola(y: Array) -> float:
     return float(here - 0.125 * (left - right) ** 2 / bend) if bend < 0 else float(here)
 
 
+def _moments(cost: Callable[[float], float]) -> tuple[float, float]:
+    """Mean and standard deviation of a density exp(-cost) near 0, a few units wide or less."""
+    mean, step = 0.0, 1.0
+    spread = step
+    for _ in range(2):
+        x = mean + step * np.arange(-_CELLS, _CELLS + 1)
+        costs = np.array([cost(float(v)) for v in x])
+        weight = np.exp(costs.min() - costs)
+        weight /= weight.sum()
+        mean = float(weight @ x)
+        spread = float(np.sqrt(weight @ (x - mean) ** 2 + step**2 / 12))  # of the grid, too
+        step = max(spread, step / 3) * _WIDE / _CELLS
+    return mean, spread
+
+
 def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> Travel:
     direction = 1 if signed > 0 else -1
     rough = abs(signed)
@@ -398,22 +414,17 @@ def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> 
         cost,
         start,
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.01, "maxfev": 120},
+        options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 60},
     )
     top = np.asarray(found.x)
-    # the likelihood may have several tops: integrated along the speed, its curvature across
-    x = top[0] + np.arange(-6.0, 6.01, 0.5)
-    costs = np.array([cost(np.array([v, top[1]])) for v in x])
-    weight = np.exp(costs.min() - costs)
-    weight /= weight.sum()
-    mean = float(weight @ x)
-    spread = float(np.sqrt(weight @ (x - mean) ** 2))
-    across = np.array([cost(top + np.array([0.0, y])) for y in (-1.0, 0.0, 1.0)])
-    bent = max(float(across[0] - 2 * across[1] + across[2]), 1e-3)
-    motion = motion_at(np.array([mean, top[1]]))
+    # the likelihood has many small tops, whose curvature tells nothing: integrated. About the
+    # middle of the record both parameters are nearly independent.
+    x, spread = _moments(lambda z: cost(top + np.array([z, 0.0])))
+    y, across = _moments(lambda z: cost(top + np.array([0.0, z])))
+    motion = motion_at(top + np.array([x, y]))
     covariance = np.zeros((3, 3))
     covariance[1, 1] = (unit_v * spread) ** 2 + (PLACE_SIGMA * motion.speed / pair.baseline) ** 2
-    covariance[2, 2] = min(unit_a**2 / bent, PRIOR_ACCELERATION**2)
+    covariance[2, 2] = min((unit_a * across) ** 2, PRIOR_ACCELERATION**2)
     wave, energy = (_correlation(a, b) for a, b, _ in _features_under(pair, motion, direction))
     return Travel(
         Motion(epoch, 0.0, motion.speed, motion.acceleration, covariance),

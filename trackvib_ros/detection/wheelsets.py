@@ -228,6 +228,18 @@ def _own(rest: Array, r: Array, places: Array, q: Array) -> Array:
     return np.asarray(rest + np.where(lag[rows, near] < 0.5 * _LEAST / CELL, own, 0.0))
 
 
+def _left(rest: Array, r: Array, places: Array) -> float:
+    """Standard deviation of what wheelsets leave of a matched filter's output along the train.
+
+    Places and heights took two of the independent values each (Bartlett: N / sum of r²).
+    """
+    half = r.size // 2
+    part = rest[max(int(places[0]) - half, 0) : int(places[-1]) + half + 1]
+    values = part.size / (2 * float(r @ r) / float(r[0]) ** 2 - 1)
+    freedom = max(1 - 2 * places.size / values, 0.1)
+    return float(np.sqrt(np.mean(part**2) / freedom))
+
+
 def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
     """The wheelsets in a signal.
 
@@ -275,10 +287,11 @@ def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
         height = float(np.median(q))
     numbers = chain.numbers(_PATHS, np.random.default_rng(0))
     slope = float(np.sqrt(np.gradient(pulse) @ np.gradient(pulse)))
+    left = _left(filtered(rest), overlap(), places)
     return Wheelsets(
         place=places * CELL,
         level=q / height,
-        sigma=CELL * deviation / (slope * np.maximum(q, 0.2 * height)),
+        sigma=CELL * left / (slope * np.maximum(q, 0.2 * height)),
         contrast=height / deviation,
         certainty=float(np.mean(numbers == places.size)),
         explained=float(1 - rest @ rest / (y @ y)),
