@@ -58,9 +58,12 @@ class Integral:
         if self._rate is None:
             return np.asarray(np.interp(time, self._edges, self._sum))
         place = (np.asarray(time) - self._edges[0]) * self._rate
-        place = np.clip(place, 0.0, self._edges.size - 1.0)
+        place = np.minimum(np.maximum(place, 0.0), self._edges.size - 1.0)
         bins = place.astype(np.intp)
-        return np.asarray(self._sum[bins] + (place - bins) * self._rise[bins])
+        place -= bins
+        place *= self._rise.take(bins)
+        place += self._sum.take(bins)
+        return np.asarray(place)
 
 
 def lasting(energy: Array, step: float) -> Array:
@@ -179,11 +182,11 @@ class Match:
 def _weights(n: int, sigma: float) -> Array:
     k = 2 * np.pi * np.arange(n // 2 + 1) / (n * _CELL)
     fine = np.exp(-0.5 * (k * sigma) ** 2)
-    return np.asarray(fine - np.exp(-0.5 * (k * _BACKGROUND) ** 2))
+    return np.asarray(fine - np.exp(-0.5 * (k * _BACKGROUND) ** 2), dtype=np.float32)
 
 
-def _comb(places: Array, n: int) -> Array:
-    comb = np.zeros(n)
+def _comb(places: Array, n: int) -> NDArray[np.float32]:
+    comb = np.zeros(n, dtype=np.float32)
     cell = places / _CELL
     first = np.floor(cell).astype(int)
     np.add.at(comb, first, 1 - (cell - first))
@@ -200,7 +203,8 @@ def _resample(trace: Trace, epoch: float, speed: Array, acceleration: float, n: 
     root = np.sqrt(np.where(reachable, square, 0.01 * v * v))
     times = epoch + 2 * edges / (v + root)
     level = trace.levels(times)
-    return np.asarray(np.where(reachable[:, 1:] & reachable[:, :-1], level, 0.0))
+    both = reachable[:, 1:] & reachable[:, :-1]
+    return np.asarray(np.where(both, level, 0.0), dtype=np.float32)
 
 
 Placed: TypeAlias = tuple[Trace, float]
@@ -216,8 +220,12 @@ def _scan_once(
     speeds: Array,
     acceleration: float,
     sigma: float,
+    combs: dict[tuple[int, int], NDArray[np.complex64]],
 ) -> list[Match]:
-    """Best match of every train for one acceleration; its score is the mean of the channels."""
+    """Best match of every train for one acceleration; its score is the mean of the channels.
+
+    The spectra of the trains, by number and size, are kept in ``combs``.
+    """
     apart = max(abs(shift) for _, shift in traces)
     best: list[Match] = []
     found: dict[int, Match] = {}
@@ -238,10 +246,11 @@ def _scan_once(
             rows = np.flatnonzero((part >= ranges[j][0]) & (part <= ranges[j][1]))
             if rows.size == 0:
                 continue
-            comb = fft.rfft(_comb(train.oriented(reverse), n)) * weights
-            size = np.sqrt(np.sum(np.abs(comb) ** 2) * 2 / n)
-            scores = fft.irfft(signal[rows] * np.conj(comb), n, axis=1)
-            scores /= max(size, 1e-30)
+            if (j, n) not in combs:
+                comb = np.conj(fft.rfft(_comb(train.oriented(reverse), n)) * weights)
+                combs[j, n] = comb / max(np.sqrt(np.sum(np.abs(comb) ** 2) * 2 / n), 1e-30)
+            matched = signal[rows[0] : rows[-1] + 1] * combs[j, n]
+            scores = fft.irfft(matched, n, axis=1)
             row, offset = np.unravel_index(int(np.argmax(scores)), scores.shape)
             score = float(scores[row, offset])
             if j in found and found[j].score >= score:
@@ -264,14 +273,17 @@ def _together(
     acceleration: float,
     n: int,
     weights: Array,
-) -> NDArray[np.complex128]:
+) -> NDArray[np.complex64]:
     """Spectra of the levels, each of norm 1, shifted to the first channel and averaged."""
-    total = np.zeros((speeds.size, n // 2 + 1), dtype=np.complex128)
+    total = np.zeros((speeds.size, n // 2 + 1), dtype=np.complex64)
     k = 2 * np.pi * np.arange(n // 2 + 1) / (n * _CELL)
     for trace, shift in traces:
         signal = fft.rfft(_resample(trace, epoch, speeds, acceleration, n), axis=1) * weights
         norm = np.sqrt(np.sum(np.abs(signal) ** 2, axis=1, keepdims=True) * 2 / n)
-        total += signal * np.exp(1j * k * shift) / np.maximum(norm, 1e-30)
+        signal /= np.maximum(norm, 1e-30)
+        if shift:
+            signal *= np.exp(1j * k * shift).astype(np.complex64)
+        total += signal
     return total / len(traces)
 
 
@@ -323,6 +335,7 @@ def scan(
     low = min(r[0] for r in ranges)
     high = max(r[1] for r in ranges)
     best: dict[tuple[str, bool], Match] = {}
+    combs: dict[tuple[int, int], NDArray[np.complex64]] = {}
     for acceleration in accelerations(duration, _COARSE_BEND):
         for match in _scan_once(
             traces,
@@ -333,6 +346,7 @@ def scan(
             _grid(low, high, _SPEED_STEP),
             float(acceleration),
             _COARSE,
+            combs,
         ):
             key = (match.train.name, match.reverse)
             if key not in best or match.score > best[key].score:
@@ -374,6 +388,7 @@ def stretched(
     """Score of a match whose shifts are each multiplied by a factor, shape (factors,)."""
     duration = max(interval[1] - interval[0], 0.2)
     out = np.empty(factors.size)
+    combs: dict[tuple[int, int], NDArray[np.complex64]] = {}
     for i, factor in enumerate(factors):
         (found,) = _scan_once(
             [(trace, factor * shift) for trace, shift in traces],
@@ -384,6 +399,7 @@ def stretched(
             np.array([match.speed]),
             match.acceleration,
             _COARSE,
+            combs,
         )
         out[i] = found.score
     return out
@@ -397,6 +413,7 @@ def _refine(traces: Sequence[Placed], match: Match, duration: float, bend: float
         bends = [0.0] if bend == 0 else list(spread * bend * np.linspace(-1, 1, 5))
         speeds = centre.speed * (1 + _SPEED_STEP * offsets)
         limit = [(0.5 * centre.speed, 2 * centre.speed)]
+        combs: dict[tuple[int, int], NDArray[np.complex64]] = {}
         for offset in bends:
             for found in _scan_once(
                 traces,
@@ -407,6 +424,7 @@ def _refine(traces: Sequence[Placed], match: Match, duration: float, bend: float
                 speeds,
                 centre.acceleration + float(offset),
                 sigma,
+                combs,
             ):
                 if found.score > top:
                     best, top = found, found.score
