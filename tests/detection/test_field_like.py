@@ -91,6 +91,20 @@ def test_what_goes_on_beside_a_train_is_told():
     assert "overlap" in passage.quality
 
 
+def test_the_middle_of_a_train_that_no_type_explains_is_told_by_its_delay():
+    s = stand_in(SEEDS["figures"] + 44, "none", "roomy", 1000.0, 2, snr_db=25, train="ICE3")
+    times = s.axle_times(0.0)
+    first, last = (int((times[0] + f * (times[-1] - times[0])) * s.rate) for f in (0.2, 0.8))
+    short = Catalogue(tuple(t for t in catalogue() if t.name == "class_642"))
+    (passage,) = of(detect(s.rate, s.samples[first:last], s.channels, short), "passage")
+    assert passage.values["grade"] == CONFIRMED and passage.values["type"] == "unknown"
+    assert passage.quality == ("truncated_start", "truncated_end")
+    assert passage.values["direction"] == {1: "forward", -1: "backward"}[s.direction]
+    speed = passage.values["speed"]
+    middle = float(s.velocity(np.array(0.5 * (first + last) / s.rate)))
+    assert abs(speed.value - middle) < 3 * speed.sigma < 0.09 * middle
+
+
 def test_a_tight_record_in_blocks_of_any_size():
     s = stand_in(SEEDS["figures"] + 3, shape="tight", rate=1000.0, train="class_425", snr_db=25)
     data = (s.samples / np.abs(s.samples).max()).astype(np.float32)

@@ -16,12 +16,12 @@ from .catalogue import Catalogue
 from .events import Channel, Estimate, TrainEvent, Value
 from .head import HeadMatcher
 from .health import HealthBook, clipped
-from .live import Partial, arrived, departed
+from .live import Partial, arrived, departed, travelling
 from .passage import Passage
 from .passage_search import bowl_of, find_passages
 from .record import Record
 from .response import find_response
-from .strength import CORE, excited, strong_interval
+from .strength import CARRIED, CORE, excited, strong_interval
 
 Array = NDArray[np.float64]
 
@@ -98,9 +98,9 @@ class Closing:
         found = self.search(records, within) if ended.found is None else ended.found
         if ended.begun is not None:
             rails, start_ns = ended.begun
-            begin = (start_ns - ended.origin_ns) * 1e-9
-            if not (_whole(found, begin) and found[0].known):
-                part = self._truncated(rails, start_ns, ended, _whole(found, begin))
+            whole = _whole(found, (start_ns - ended.origin_ns) * 1e-9, within)
+            if not (whole and found[0].known):
+                part = self._truncated(rails, start_ns, ended, whole)
                 if part is not None:
                     return part
         elif ended.cut and len(found) <= 1:
@@ -110,6 +110,13 @@ class Closing:
             # on one channel a beginning looks like that of other types at other speeds
             if head is not None and head.direction and not _passed(found, within, head):
                 return report.truncated(self._catalogue, head, ended.origin_ns, ended.now_ns)
+            goes_on = _known(found) and _goes_on(found[-1], within)
+            if goes_on or not any(passage.confirmed for passage in found):
+                seen = travelling(rails, (within[0], stop), self._limits, self.calibration)
+                if seen is not None:
+                    return report.truncated(self._catalogue, seen, ended.origin_ns, ended.now_ns)
+            if goes_on:
+                return report.unclear(rails, ended.last_ns, ("truncated_end",))
         if not any(r.channel.layer == "rail" and excited(r, within) for r in records):
             away = [r for r in records if r.channel.layer != "rail" and excited(r, within)]
             # strong first cars end an event on a bridge early; what rings on does no harm
@@ -165,6 +172,10 @@ class Closing:
         last_ns, end = ended.last_ns, (ended.now_ns - start_ns) * 1e-9
         within = (0.0, (last_ns - start_ns) * 1e-9 + 0.3)
         found, late = departed(rails, within, self._limits, self._mirrored, self.calibration)
+        if (found is None or found.direction == 0) and not whole:
+            found = travelling(rails, within, self._limits, self.calibration) or found
+        if found is not None and found.end is None:
+            return report.truncated(self._catalogue, found, start_ns, last_ns)
         if found is not None and found.end is not None:
             quiet_s = end - found.end[0]
             if (
@@ -232,32 +243,57 @@ class Closing:
         return events
 
 
-def _whole(found: Sequence[Passage], start: float) -> bool:
-    """Whether the first of the trains is on record, from ``start`` (s), with its first wheelset."""
+def _known(found: Sequence[Passage]) -> bool:
+    """Whether the last of the trains is of a known type."""
+    return bool(found) and found[-1].known
+
+
+def _beside(train: Passage, within: tuple[float, float]) -> tuple[float, float]:
+    """For how long strong energy goes on before and behind a train of a known type (m)."""
+    best, motion = train.hypotheses[0], train.hypotheses[0].fit.motion
+    core = strong_interval(train.traces[0], train.band[1] - train.band[0], within, CORE)
+    start, end = motion.distance_at(np.array(core or train.interval)) - best.places[[0, -1]]
+    return max(0.0, -float(start)), max(0.0, float(end))
+
+
+def _whole(found: Sequence[Passage], start: float, within: tuple[float, float]) -> bool:
+    """Whether the first of the trains is on record, from ``start`` (s), with its first wheelset.
+
+    If the record begins as strong as its wheelsets, farther before the first of them than the rail
+    carries that, there are more.
+    """
     if not found or not found[0].confirmed or not found[0].hypotheses:
         return False
-    return float(found[0].hypotheses[0].fit.motion.time_at(-_AHEAD)) > start
+    motion = found[0].hypotheses[0].fit.motion
+    if found[0].known:
+        ahead = _beside(found[0], within)[0]
+        if -float(motion.distance_at(start)) - CARRIED < ahead > CARRIED:
+            return False
+    return float(motion.time_at(-_AHEAD)) > start
+
+
+def _goes_on(train: Passage, within: tuple[float, float]) -> bool:
+    """Whether a train of a known type is the beginning of a longer one.
+
+    What the rail carries is heard before the first wheelset as after the last: what is strong for
+    longer after it, and for more than the longest gap of the train, is more of it.
+    """
+    ahead, behind = _beside(train, within)
+    return behind - ahead > float(np.max(np.diff(train.hypotheses[0].places)))
 
 
 def _passed(found: Sequence[Passage], within: tuple[float, float], head: Partial) -> bool:
     """Whether a train of a known type has passed, and is not the beginning of a longer one.
 
-    What the rail carries is heard before the first wheelset as after the last: what is strong for
-    longer after it, and for more than the longest gap of the train, is more of it. And a train that
-    goes on can look like a shorter one that is faster.
+    A train that goes on can look like a shorter one that is faster.
 
     Args:
         found: trains.
         within: the event (s).
         head: what its beginning tells, whole trains among the rest.
     """
-    if not found or not found[-1].known:
+    if not _known(found) or _goes_on(found[-1], within):
         return False
-    train = found[-1]
-    best, motion = train.hypotheses[0], train.hypotheses[0].fit.motion
-    core = strong_interval(train.traces[0], train.band[1] - train.band[0], within, CORE)
-    ahead, behind = motion.distance_at(np.array(core or train.interval)) - best.places[[0, -1]]
-    if behind - max(0.0, -ahead) > np.max(np.diff(best.places)):
-        return False
+    best, motion = found[-1].hypotheses[0], found[-1].hypotheses[0].fit.motion
     sigma = np.hypot(head.sigma, motion.speed_sigma(best.mid_time))
     return bool(abs(head.speed - motion.speed_at(best.mid_time)) < _APART * sigma)

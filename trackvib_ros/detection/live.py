@@ -12,7 +12,7 @@ from .delay import find_delay
 from .head import MOST_UNCERTAIN, Head, HeadMatcher
 from .pattern import Trace
 from .record import Record
-from .strength import excited, strong_interval
+from .strength import CARRIED, excited, strong_interval
 
 AXLE_SPACING = 6.2
 """Track per wheelset of a train on bogies (m), to count how many have passed."""
@@ -67,19 +67,36 @@ def provisional(
     """Speed while the train passes: by the delay between the outer two rail channels, or by the
     axle pattern if only one has a signal. ``None`` while it is not clear.
     """
-    rails = sorted(
-        (r for r in records if r.channel.layer == "rail" and excited(r, within)),
-        key=lambda r: r.channel.x,
-    )
-    if len(rails) >= 2 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
-        delay = _by_delay(rails[0], rails[-1], within, limits, site)
-        return delay if delay is not None and delay.score >= _SURE else None
+    rails = _excited_rails(records, within)
+    if _apart(rails):
+        return provisional_delay(rails, within, limits, site)
     if not rails:
         return None
     found = _by_pattern(rails[0], within, matcher)
     # the others may only not have been reached yet
     reach = max(abs(r.channel.x - rails[0].channel.x) for r in records)
     return found if found is not None and found.distance > 1.5 * reach else None
+
+
+def provisional_delay(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    site: Calibration,
+) -> Partial | None:
+    """Speed by the delay between the outer two rail channels; ``None`` while it is not sure."""
+    rails = _excited_rails(records, within)
+    delay = _by_delay(rails[0], rails[-1], within, limits, site) if _apart(rails) else None
+    return delay if delay is not None and delay.score >= _SURE else None
+
+
+def _excited_rails(records: Sequence[Record], within: tuple[float, float]) -> list[Record]:
+    rails = (r for r in records if r.channel.layer == "rail" and excited(r, within))
+    return sorted(rails, key=lambda r: r.channel.x)
+
+
+def _apart(rails: Sequence[Record]) -> bool:
+    return len(rails) > 1 and rails[-1].channel.x - rails[0].channel.x >= 2.0
 
 
 def _by_delay(
@@ -222,6 +239,50 @@ def arrived(
     return _with_delay(found, rails, within, limits, site)
 
 
+def travelling(
+    records: Sequence[Record],
+    within: tuple[float, float],
+    limits: tuple[float, float],
+    site: Calibration,
+) -> Partial | None:
+    """A train of which the record lacks an end or both, by the delay between two rail channels.
+
+    Its ends are where strong energy begins and ends at the first channel, if in the record.
+
+    Args:
+        records: of the rail channels.
+        within: the event (s).
+        limits: speeds (m/s).
+        site: where the channels are.
+
+    Returns:
+        ``None`` if nothing surely travels, or if it is on record as a whole.
+    """
+    found = provisional_delay(records, within, limits, site)
+    if found is None:
+        return None
+    record = next(r for r in records if r.channel.name == found.sensors[0])
+    spans = [
+        span
+        for trace, (low, high) in zip(record.traces(within), record.window.bands, strict=True)
+        if (span := strong_interval(trace, high - low, within)) is not None
+    ]
+    if not spans:
+        return None
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    sigma = CARRIED / found.speed
+    begins = first - float(record.window.time[0]) > _CAR / found.speed
+    ends = float(record.window.time[-1]) - last > _CAR / found.speed
+    if begins and ends:
+        return None
+    return replace(
+        found,
+        distance=found.speed * (last - first),
+        start=(first, sigma) if begins else None,
+        end=(last, sigma) if ends else None,
+    )
+
+
 def _edge_sigma(head: Head) -> float:
     return float(np.hypot(_END_SIGMA / head.speed, 0.005))
 
@@ -251,7 +312,7 @@ def _with_delay(
 ) -> Partial:
     """What a pattern told, and the delay between the outer two channels if it agrees."""
     delay = None
-    if len(rails) > 1 and rails[-1].channel.x - rails[0].channel.x >= 2.0:
+    if _apart(rails):
         delay = _by_delay(rails[0], rails[-1], within, limits, site)
     if delay is None or abs(delay.speed - found.speed) > 3 * np.hypot(delay.sigma, found.sigma):
         return found

@@ -69,59 +69,66 @@ def update(found: Partial, now_ns: int) -> TrainEvent:
 def truncated(
     catalogue: Catalogue, found: Partial, origin_ns: int, end_ns: int
 ) -> list[TrainEvent]:
-    """Departure and summary of a train of which only an end is on record: no count, no type.
+    """Departure and summary of a train that lacks an end or both on record: no count, no type.
 
     Args:
         catalogue: for its version and its longest train.
-        found: the part on record, with its first or its last wheelset.
+        found: the part on record, with its first or its last wheelset if that is.
         origin_ns: what its times (s) are from: the start of the record if that lies in the train.
         end_ns: end of the record if that lies in the train.
     """
-    edge = found.start or found.end
-    assert edge is not None
-    edge_ns, edge_sigma = origin_ns + round(edge[0] * 1e9), edge[1]
     longest = max(train.span for train in catalogue)
     # a train may have begun to pass as long before as the longest one takes, or go on as long
-    unseen = max(longest - found.distance, 0.0) / found.speed + edge_sigma
+    unseen = max(longest - found.distance, 0.0) / found.speed
+    unseen += max((edge[1] for edge in (found.start, found.end) if edge), default=0.0)
+    arrival, departure = (origin_ns, unseen), (end_ns, unseen)
+    flags, methods, ends = [], [found.method, found.method], {}
+    if found.start is None:
+        flags.append("truncated_start")
+        methods[0] += "; stamped with the start of the record, arrival unknown"
+    else:
+        arrival = origin_ns + round(found.start[0] * 1e9), found.start[1]
+        ends = {"arrival_ns": arrival[0], "arrival_sigma": arrival[1]}
+    if found.end is None:
+        flags.append("truncated_end")
+        methods[1] += "; stamped with the end of the record, departure unknown"
+    else:
+        departure = origin_ns + round(found.end[0] * 1e9), found.end[1]
+        ends |= {"departure_ns": departure[0], "departure_sigma": departure[1]}
     confidence = float(np.clip(found.score, 0.0, 0.95))
     place = Estimate(found.x, 0.0, "m")
     part = found.distance * found.sigma / found.speed
-    begun = found.start is None
-    missing = "arrival" if begun else "departure"
-    flags = ("truncated_start" if begun else "truncated_end",)
-    stamped = f"stamped with the {'start' if begun else 'end'} of the record, {missing} unknown"
-    seen = "departure" if begun else "arrival"
-    arrival = (origin_ns, unseen) if begun else (edge_ns, edge_sigma)
-    departure = (edge_ns, edge_sigma) if begun else (end_ns, unseen)
+    shown: dict[str, Value] = {}
+    if found.types:
+        shown[f"types_of_the_{'end' if found.start is None else 'beginning'}"] = found.types
     return [
         TrainEvent(
             kind="departure",
             stamp_ns=departure[0],
             sigma_s=departure[1],
             confidence=confidence,
-            method=found.method if begun else f"{found.method}; {stamped}",
+            method=methods[1],
             sensors=found.sensors,
             values={"grade": CONFIRMED, "reference_x": place},
-            quality=flags,
+            quality=tuple(flags),
         ),
         TrainEvent(
             kind="passage",
             stamp_ns=arrival[0],
             sigma_s=arrival[1],
             confidence=confidence,
-            method=f"{found.method}; {stamped}" if begun else found.method,
+            method=methods[0],
             sensors=found.sensors,
             values={
                 "grade": CONFIRMED,
                 "reference": found.sensors[0],
                 "reference_x": place,
-                f"{seen}_ns": edge_ns,
-                f"{seen}_sigma": edge_sigma,
+                **ends,
                 "speed": Estimate(found.speed, found.sigma, "m/s"),
                 "speed_at": "middle of the part on record at the reference point",
                 "direction": DIRECTION[found.direction],
                 "type": "unknown",
-                f"types_of_the_{'end' if begun else 'beginning'}": found.types,
+                **shown,
                 "families": found.families,
                 "cars": "unknown",
                 "units": "unknown",
@@ -129,7 +136,7 @@ def truncated(
                 "score": round(found.score, 4),
                 "catalogue": catalogue.version,
             },
-            quality=flags,
+            quality=tuple(flags),
         ),
     ]
 

@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 STRONG, CORE = 1 / 16, 1 / 4
 """Of the strong energy: 12 and 6 dB below."""
 
+CARRIED = 4.0
+"""Strong energy before the first wheelset and behind the last (m): 0 to 3.4 m on computed rails."""
+
 
 def smoothed(trace: Trace, width_s: float) -> Array:
     """Energy averaged over ``width_s`` about every bin."""
