@@ -1,13 +1,20 @@
-"""``python -m trackvib_ros.start sensor|detector [--ros-args ...]``: the process of a node.
+"""How processes begin: the command ``trackvib``, and ``python -m trackvib_ros.start
+sensor|detector [--ros-args ...]``, the process of a node.
 
-Signals are caught before the imports, which take a second: until a node exists there is nothing to
-clean up.
+Before the imports, which take a second, signals are caught, for until a node exists there is
+nothing to clean up, and numpy is kept to one thread. Matrices are small here: more threads wait for
+each other, and on two cores for the other node, at ten times the work of one.
 """
 
 import os
 import signal
 import sys
 from types import FrameType
+
+
+def _one_thread() -> None:
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def _leave(_number: int, _frame: FrameType | None) -> None:
@@ -20,6 +27,7 @@ def main() -> None:
         signal.signal(number, _leave)
     if len(sys.argv) < 2 or sys.argv[1] not in ("sensor", "detector"):
         sys.exit("name the node to start: sensor or detector")
+    _one_thread()
     from trackvib_ros.process import main as run_node
 
     if sys.argv[1] == "sensor":
@@ -30,6 +38,14 @@ def main() -> None:
         from trackvib_ros.detector_node import DetectorNode
 
         run_node(DetectorNode)
+
+
+def command() -> None:
+    """Run the command line."""
+    _one_thread()
+    from trackvib_ros.cli import main as run_command
+
+    run_command()
 
 
 if __name__ == "__main__":

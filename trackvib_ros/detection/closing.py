@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -82,18 +83,31 @@ class Closing:
         self.health = HealthBook(channels)
         self._catalogue = catalogue
         self._limits = limits
+        self._lessons: deque[tuple[Record, Passage]] = deque()
+
+    def study(self, lessons: int | None = None) -> None:
+        """Learn what trains have shown of their deflection, and what events need not wait for.
+
+        Args:
+            lessons: channels of a passage, the oldest first; all by default.
+        """
+        for _ in range(len(self._lessons) if lessons is None else lessons):
+            if not self._lessons:
+                return
+            self._learn_bowl(*self._lessons.popleft())
 
     def search(
         self, records: Sequence[Record], within: tuple[float, float], unlisted: bool = True
     ) -> list[Passage]:
         """Every train that the rail channels show in an interval (s), quicker without those that no
         type explains."""
+        self.study()
         return find_passages(
             records, within, self._catalogue, self._limits, self.calibration, unlisted
         )
 
     def conclude(self, ended: Ended) -> list[TrainEvent]:
-        """The events at the end of an event; what its trains teach is kept."""
+        """The events at the end of an event; what its trains teach is kept, or to be studied."""
         records, within = ended.records, ended.within
         found = self.search(records, within) if ended.found is None else ended.found
         if ended.begun is not None:
@@ -131,24 +145,21 @@ class Closing:
             if passage.confirmed and passage.known and passage.measured is not None and not swapped:
                 self.calibration = self.calibration.learned(passage.measured)
             if passage.confirmed and passage.known and not swapped and not passage.clock_offset:
-                self._learn_bowls(records, passage)
+                names = {trace.name for trace in passage.traces}
+                self._lessons.extend((r, passage) for r in records if r.channel.name in names)
         events = self._passage_health(ended.now_ns, records, within, found, swapped)
         return events + report.closing(self._catalogue, records, ended.origin_ns, within, found)
 
-    def _learn_bowls(self, records: Sequence[Record], passage: Passage) -> None:
-        """How long the deflection is, at the channels where that is not known well enough yet."""
-        names = {trace.name for trace in passage.traces}
-        best = passage.hypotheses[0]
-        speed = float(best.fit.motion.speed_at(best.mid_time))
-        for record in records:
-            name = record.channel.name
-            if name not in names or self.calibration.wavenumber(name)[1] < _ENOUGH * SHAPE_SIGMA:
-                continue
-            shown = bowl_of(record, passage)
-            if shown is not None:
-                self.calibration = self.calibration.learned_bowl(
-                    name, shown.value / speed, shown.sigma
-                )
+    def _learn_bowl(self, record: Record, passage: Passage) -> None:
+        """How long the deflection is, at a channel where that is not known well enough yet."""
+        name = record.channel.name
+        if self.calibration.wavenumber(name)[1] < _ENOUGH * SHAPE_SIGMA:
+            return
+        shown = bowl_of(record, passage)
+        if shown is not None:
+            best = passage.hypotheses[0]
+            speed = float(best.fit.motion.speed_at(best.mid_time))
+            self.calibration = self.calibration.learned_bowl(name, shown.value / speed, shown.sigma)
 
     @cached_property
     def _heads(self) -> HeadMatcher:

@@ -170,7 +170,10 @@ class TrainDetector:
 
     @property
     def calibration(self) -> Calibration:
-        """Where the channels are, as learned from the passages so far."""
+        """Where the channels are, as learned from the passages so far.
+
+        How long the deflection is, is learned in the blocks after a passage, or at the end.
+        """
         return self._closing.calibration
 
     def process(self, block: Waveform) -> list[TrainEvent]:
@@ -185,6 +188,7 @@ class TrainDetector:
         group = self._group_of(block)
         if not len(block.data):
             return []
+        self._closing.study(1)
         if self._start_ns is None:
             self._start_ns = self._done_ns = block.stamp_ns
         group.stream.push(block)
@@ -205,6 +209,7 @@ class TrainDetector:
                 events += self._frames(2**62)
         if self._event is not None:
             events += self._close(now, cut=True)
+        self._closing.study()
         return events
 
     def _group_of(self, block: Waveform) -> Group:
