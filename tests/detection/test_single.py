@@ -108,6 +108,10 @@ def test_wheelsets_elsewhere_contradict_a_type():
     for k in (0, 8, PLACES.size - 2):
         fewer = replace(blind, times=np.delete(blind.times, [k, k + 1]))
         assert not fewer.contradicts(PLACES, motion, wave)
+    # not one of the type's was seen: they are there, or not
+    one = replace(blind, times=blind.times[:1])
+    assert not one.contradicts(PLACES[2:6], motion, wave)
+    assert one.contradicts(np.array([33.0, 35.5, 58.0, 60.5]), motion, wave)
 
 
 @pytest.mark.parametrize("speed", [5.0, 110.0])

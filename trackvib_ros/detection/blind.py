@@ -114,6 +114,8 @@ class Blind:
         cost = 0.5 * float(np.log(both.size))
 
         def gain(at: Array) -> float:
+            if not at.size:
+                return 0.0
             span, guess = (float(first), float(last)), WAVENUMBER * motion.speed
             fine = corner(wave, motion.time_at(at), guess, _AMONG, refits=0, span=span)
             return -np.inf if fine is None else fine.gain
