@@ -187,7 +187,7 @@ def departed(
             if interval is None:
                 continue
             head = mirrored.match(_mirrored(trace), -interval[1], -start)
-            if head and (best is None or head.score > best[0].score):
+            if head and (best is None or _better(head, best[0])):
                 best = head, record, (interval[0] - start, -head.start)
     if best is None:
         return None, np.inf
@@ -229,7 +229,7 @@ def arrived(
             if interval is None:
                 continue
             head = matcher.match(trace, interval[0], stop)
-            if head and (best is None or head.score > best[0].score):
+            if head and (best is None or _better(head, best[0])):
                 best = head, record, stop - interval[1]
     if best is None or not best[0].clear or best[0].speed * best[2] > _CAR:
         return None
@@ -281,6 +281,11 @@ def travelling(
         start=(first, sigma) if begins else None,
         end=(last, sigma) if ends else None,
     )
+
+
+def _better(head: Head, than: Head) -> bool:
+    """Whether a band tells more than another: one in which types look alike tells no speed."""
+    return (head.clear, head.score) > (than.clear, than.score)
 
 
 def _edge_sigma(head: Head) -> float:
