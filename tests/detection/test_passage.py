@@ -29,7 +29,7 @@ def _passage(scatter: np.ndarray, direction: int = 1) -> Passage:
         contrast=np.full(time.shape, 0.2),
         observed=np.ones(time.shape, dtype=bool),
         offset=fit.offset,
-        place_sigma=np.full(2, 0.2),
+        place=0.04 * np.eye(2),
     )
     grid = np.arange(0.0, 10.0, 0.001)
     trace = Trace("a", 0.0, grid, np.ones(grid.size), np.ones(grid.size, bool), 1.0, 0.001)

@@ -7,6 +7,7 @@ from trackvib_ros.detection import Catalogue
 from trackvib_ros.detection.passage_scan import Scanned, _alone
 from trackvib_ros.detection.pattern import Integral, Match, Trace, lasting
 from trackvib_ros.detection.place import Wave
+from trackvib_ros.detection.strength import strong, strong_interval
 
 
 @pytest.mark.parametrize("gap", [0.0, 7.0])
@@ -33,6 +34,30 @@ def test_levels_of_successive_intervals():
     np.testing.assert_allclose(
         trace.levels(edges), trace.level(edges[:-1], edges[1:]), rtol=1e-9, atol=1e-12
     )
+
+
+def test_one_loud_bin_beside_a_hole_is_not_strong():
+    """Noise with holes of 60 ms that end in one bin of ten times its level: one bin in 40 ms of ten
+    degrees of freedom each tells nothing. A train of ten times the level is strong for as long as
+    it lasts, holes or not."""
+    rng, step, holes = np.random.default_rng(4), 0.001, np.arange(300, 9000, 200)
+    time = step * np.arange(10_000)
+    valid = np.ones(time.size, dtype=bool)
+    for start in holes:
+        valid[start : start + 60] = False
+    energy = rng.chisquare(1, time.size)
+    energy[holes - 1] = energy[holes + 60] = 10.0
+    train = (time > 4.0) & (time < 6.0)
+    quiet = Trace("a", 0.0, time, energy, valid, 1.0, step)
+    loud = Trace("a", 0.0, time, energy * np.where(train, 10.0, 1.0), valid, 1.0, step)
+    assert not strong(quiet, 500.0, (0.0, 10.0)).any()
+    found = strong_interval(loud, 500.0, (0.0, 10.0))
+    assert found == pytest.approx((4.0, 6.0), abs=0.09)
+    at = rng.uniform(0.0, 9.9, 50)
+    inside = (time[:, None] >= at + step) & (time[:, None] < at + 0.1 - step)
+    mean = np.sum(energy[:, None] * (inside & valid[:, None]), axis=0)
+    mean /= np.maximum(np.sum(inside & valid[:, None], axis=0), 1)
+    np.testing.assert_allclose(quiet.shown(at, at + 0.1), mean, rtol=0.5)
 
 
 def test_blows_do_not_last():

@@ -12,6 +12,7 @@ from .blind import Blind
 from .calibration import Measured
 from .catalogue import TrainType
 from .evidence import Explanation
+from .passage_scan import HOPELESS_SCORE
 from .pattern import Trace
 
 Array = NDArray[np.float64]
@@ -42,7 +43,8 @@ SEEN = 0.5
 
 IN_STEP_SCORE = 0.535
 """Least pattern correlation of two channels in step, of a train whose deflection shows it too: as
-significant as :data:`SCATTERED_SCORE` of one (1 - r² is the root of that of one)."""
+significant as :data:`SCATTERED_SCORE` of one (1 - r² is the root of that of one). If the places of
+the wheelsets agree as well, these two tell more than the correlation, which holes spoil."""
 
 IN_PHASE = 30.0
 """ln of the likelihood at which the deflection shows a train: odds of e^20 after all its trials."""
@@ -178,7 +180,7 @@ class Passage:
         seen = np.sum(fit.observed & (fit.contrast > SEEN), axis=1)
         shown = max(fit.in_phase, self.hypotheses[0].phase if self.unknown < 0.5 else 0.0)
         if shown > IN_PHASE and self.direction != 0:
-            return self.score >= IN_STEP_SCORE
+            return self.score >= (HOPELESS_SCORE if self._in_place > IN_PLACE else IN_STEP_SCORE)
         if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))) and not (
             self.direction != 0 and self._in_place > IN_PLACE
         ):

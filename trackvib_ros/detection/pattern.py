@@ -126,10 +126,17 @@ class Trace:
         self._ends = float(edges[0]), float(edges[-1])
         self._energy = Integral(edges, filled)
         self._known = Integral(edges, valid.astype(np.float64))
+        self._shown = self._energy if valid.all() else Integral(edges, filled * valid)
 
     def mean(self, start: Array, stop: Array) -> Array:
         """Mean energy between two times (s); :attr:`noise` outside the record."""
         return self._over(self._energy(stop) - self._energy(start), start, stop)
+
+    def shown(self, start: Array, stop: Array) -> Array:
+        """Mean energy of what was measured between two times (s); else :attr:`noise`."""
+        time = self._known(stop) - self._known(start)
+        total = self._shown(stop) - self._shown(start)
+        return np.where(time > _EVEN * self.step, total / np.maximum(time, 1e-12), self.noise)
 
     def _over(self, total: Array, start: Array, stop: Array) -> Array:
         length = np.clip(stop, *self._ends) - np.clip(start, *self._ends)

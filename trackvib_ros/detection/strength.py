@@ -10,6 +10,9 @@ from .record import Record
 
 Array = NDArray[np.float64]
 
+_AVERAGE_S = 0.04
+_LEAST_SHARE = 0.25  # of that time, measured
+
 STRONG, CORE = 1 / 16, 1 / 4
 """Of the strong energy: 12 and 6 dB below."""
 
@@ -17,28 +20,23 @@ CARRIED = 4.0
 """Strong energy before the first wheelset and behind the last (m): 0 to 3.4 m on computed rails."""
 
 
-def smoothed(trace: Trace, width_s: float) -> Array:
-    """Energy averaged over ``width_s`` about every bin."""
-    return trace.mean(trace.time - width_s / 2, trace.time + width_s / 2)
-
-
-def _measured(trace: Trace, width_s: float) -> Array:
-    """Part of ``width_s`` about every bin that was measured."""
-    return trace.coverage(trace.time - width_s / 2, trace.time + width_s / 2)
-
-
 def strong(
     trace: Trace, bandwidth: float, within: tuple[float, float], below: float = STRONG
 ) -> NDArray[np.bool_]:
-    """Bins whose 40 ms energy stands out of the noise and within 12 dB of the strong ones."""
-    energy = smoothed(trace, 0.04)
+    """Bins whose energy in 40 ms stands out of the noise and within 12 dB of the strong ones.
+
+    The fewer of these 40 ms were measured, the more must it stand out.
+    """
+    start, stop = trace.time - _AVERAGE_S / 2, trace.time + _AVERAGE_S / 2
+    energy = trace.shown(start, stop)
     inside = (trace.time >= within[0]) & (trace.time <= within[1])
     if not inside.any():
         return inside
     top = float(np.percentile(energy[inside], 95))
-    freedom = np.maximum(2 * bandwidth * 0.04 * _measured(trace, 0.04), 2.0)
+    share = trace.coverage(start, stop)
+    freedom = np.maximum(2 * bandwidth * _AVERAGE_S * share, 2.0)
     limit = np.maximum(trace.noise * (1 + 6 * np.sqrt(2 / freedom)), top * below)
-    return np.asarray(inside & (energy > limit))
+    return np.asarray(inside & (energy > limit) & (share > _LEAST_SHARE))
 
 
 def strong_interval(
