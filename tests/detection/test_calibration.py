@@ -48,7 +48,46 @@ def test_stated_sigma_holds_while_learning():
 
 def test_a_contradiction_teaches_nothing():
     state = Calibration.untaught(CHANNELS, 0.02)
-    assert state.learned(measured(0.5)) is state
+    found = state.learned(measured(0.5))
+    assert found.to_json() == state.to_json()
+
+
+def test_contradictions_that_agree_are_a_sensor_that_was_moved():
+    rng = np.random.default_rng(1)
+    needed, ratios = [], []
+    for _ in range(100):
+        true = 0.3 + abs(rng.standard_normal())
+        state = Calibration.untaught(CHANNELS, 0.02)
+        for _ in range(3):
+            state = state.learned(measured(0.03 * rng.standard_normal()))
+        count = 0
+        while state.passages == 3:
+            state, count = state.learned(measured(true + 0.03 * rng.standard_normal())), count + 1
+        needed.append(count)
+        offset, covariance = state.relative(NAMES)
+        ratios.append((offset[1] - true) / covariance[1, 1] ** 0.5)
+    # the first one says where; each that agrees within 0.04 m or so is 20 to 40 times (ln 3 to 3.7)
+    # as likely as an accident within 1.4 m, and ln 1000 + ln 19 = 9.9 are asked for
+    assert min(needed) >= 3 and np.median(needed) == 4 and max(needed) <= 7
+    # 100 draws: 1 +- 3 / sqrt(200)
+    assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.25
+
+
+def test_accidents_are_no_moved_sensor():
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        state = Calibration.untaught(CHANNELS, 0.02)
+        # one in ten passages is of another train than was thought
+        for k in range(1, 101):
+            wrong = 2**0.5 * rng.standard_normal() if k % 10 == 0 else 0.0
+            state = state.learned(measured(wrong + 0.03 * rng.standard_normal()))
+        assert abs(state.relative(NAMES)[0][1]) < 0.05
+    for _ in range(20):
+        state = Calibration.untaught(CHANNELS, 0.02)
+        for _ in range(20):  # nothing but accidents
+            state = state.learned(measured(2**0.5 * rng.standard_normal()))
+        # those within four sigmas of what was stated, 4 sqrt(2 x 0.02² + 0.03²), do count
+        assert abs(state.relative(NAMES)[0][1]) < 0.17
 
 
 def test_old_passages_fade():

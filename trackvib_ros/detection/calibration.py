@@ -23,6 +23,7 @@ from solver import InputError
 
 from .bowl import SHAPE_SIGMA, WAVENUMBER, WAVENUMBER_SPREAD
 from .events import POSITION_SIGMA, Channel
+from .evidence import PRIOR_MOVED
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,8 @@ SCHEMA = "trackvib-calibration-3"
 _MEMORY = 300.0  # passages after which what was learned has faded to what was stated
 _SAME_PLACE = 1e-6  # m
 _GATE = 4.0  # standard deviations: more is another train than was thought, or a moved sensor
+_FAR = 1.0  # m, by how much a channel is elsewhere, or an accident puts it
+_ELSEWHERE = float(np.log(19.0))  # ln of odds of 95 %, at which it is
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,16 @@ class Measured:
     channels: tuple[str, ...]
     offset: Array
     covariance: Array
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Where the channels are if what contradicts all that was learned is right: offsets (m) and
+    their covariance (m²) as in :class:`Calibration`, and ln of the odds of it."""
+
+    offset: Array
+    covariance: Array
+    log_odds: float
 
 
 @dataclass(frozen=True)
@@ -58,6 +71,8 @@ class Calibration:
         bowl: ln of the wavenumber k0 (rad/m) of the rail's deflection at every channel
             (:mod:`bowl`), shape (channels,).
         bowl_variance: of it, shape (channels,).
+        doubt: what passages that contradict it say, since the last one that did not. The text of a
+            calibration leaves it out.
     """
 
     channels: tuple[str, ...]
@@ -68,6 +83,7 @@ class Calibration:
     passages: int
     bowl: Array
     bowl_variance: Array
+    doubt: Doubt | None = None
 
     @classmethod
     def untaught(cls, channels: Sequence[Channel], stated: float = POSITION_SIGMA) -> Calibration:
@@ -135,21 +151,55 @@ class Calibration:
         return rows @ self.offset, rows @ self.covariance @ rows.T
 
     def learned(self, found: Measured) -> Calibration:
-        """What a passage adds; nothing if it contradicts by more than four standard deviations."""
+        """What a passage adds.
+
+        One that contradicts by more than four standard deviations is an accident, another train
+        than was thought, or channels are elsewhere by a metre or so (prior
+        :data:`evidence.PRIOR_MOVED`). Accidents scatter as far, those of a sensor that was moved
+        agree: once this is 95 % likely, what they say is what was learned.
+        """
+        prior = self.covariance + self._drift
+        surprise, expected = self._surprise(found, self.offset, prior)
+        if not np.any(np.abs(surprise) > _GATE * np.sqrt(np.diag(expected))):
+            offset, covariance = self._updated(found, self.offset, prior)
+            return self._with(offset, covariance, None)
+        far = prior + _FAR**2 * np.eye(len(prior))
+        if self.doubt is None:
+            doubt = Doubt(*self._updated(found, self.offset, far), float(np.log(PRIOR_MOVED)))
+            return replace(self, doubt=doubt)
+        elsewhere = self.doubt.offset, self.doubt.covariance + self._drift
+        log_odds = self.doubt.log_odds + _log_density(*self._surprise(found, *elsewhere))
+        log_odds -= _log_density(*self._surprise(found, self.offset, far))
+        offset, covariance = self._updated(found, *elsewhere)
+        if log_odds > _ELSEWHERE:
+            return self._with(offset, covariance, None)
+        return replace(self, doubt=Doubt(offset, covariance, log_odds))
+
+    @property
+    def _drift(self) -> Array:
+        """Covariance by which places may have changed from one passage to the next (m²)."""
+        return np.asarray(np.diag(2 * self.stated**2 / _MEMORY))
+
+    def _with(self, offset: Array, covariance: Array, doubt: Doubt | None) -> Calibration:
+        return replace(
+            self, offset=offset, covariance=covariance, passages=self.passages + 1, doubt=doubt
+        )
+
+    def _surprise(self, found: Measured, offset: Array, prior: Array) -> tuple[Array, Array]:
+        """What a passage says beyond offsets (m), and the covariance expected of it (m²)."""
         rows = self._differences(found.channels)[1:]
-        prior = self.covariance + np.diag(2 * self.stated**2 / _MEMORY)
-        surprise = found.offset[1:] - rows @ self.offset
-        expected = rows @ prior @ rows.T + found.covariance[1:, 1:]
-        if np.any(np.abs(surprise) > _GATE * np.sqrt(np.diag(expected))):
-            return self
+        return (
+            found.offset[1:] - rows @ offset,
+            rows @ prior @ rows.T + found.covariance[1:, 1:],
+        )
+
+    def _updated(self, found: Measured, offset: Array, prior: Array) -> tuple[Array, Array]:
+        """Offsets (m) with what a passage says, and their covariance (m²)."""
+        rows = self._differences(found.channels)[1:]
+        surprise, expected = self._surprise(found, offset, prior)
         gain = prior @ rows.T @ np.linalg.inv(expected)
         covariance = prior - gain @ rows @ prior
-        return replace(
-            self,
-            offset=self.offset + gain @ surprise,
-            covariance=0.5 * (covariance + covariance.T),
-            passages=self.passages + 1,
-        )
+        return offset + gain @ surprise, 0.5 * (covariance + covariance.T)
 
     def _differences(self, names: Sequence[str]) -> Array:
         """Rows that take channels relative to the first."""
@@ -252,3 +302,9 @@ class Calibration:
         if not (np.isfinite(bowl).all() and np.isfinite(variance).all() and np.all(variance > 0)):
             raise InputError("calibration: ln_bowl_variance must be finite and positive (-)")
         return cls(names, positions, offset, covariance, stated, passages, bowl, variance)
+
+
+def _log_density(surprise: Array, covariance: Array) -> float:
+    """ln of a Gaussian density, but for a constant."""
+    misfit = float(surprise @ np.linalg.solve(covariance, surprise))
+    return -0.5 * (misfit + float(np.linalg.slogdet(covariance)[1]))
