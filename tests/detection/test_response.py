@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, Estimate, TrainEvent, detect
 from trackvib_ros.detection.events import Layer
 from trackvib_ros.detection.response_model import Model, Observation, Spectrum, comb, ringing
-from trackvib_ros.detection.unlisted import CAR, EqualCars
+from trackvib_ros.detection.unlisted import CAR, EqualCars, like
 from trackvib_ros.nuisances import RATE, nuisance
 
 Array = NDArray[np.float64]
@@ -232,23 +232,62 @@ def test_stated_sigma_holds_the_error() -> None:
     assert 0.25 < rms < 1.0
 
 
-def test_an_unlisted_train_is_told_as_unknown() -> None:
-    """Four equal cars of 23 m: metros of the catalogue repeat nearly alike at another speed."""
-    cars, speed = EqualCars(4, 0.74, 0.11), 30.0
-    axles = 23.0 / CAR[0] * cars.train.axles
+@pytest.mark.parametrize(
+    ("cars", "length", "speed", "types"),
+    [
+        (EqualCars(4, 0.74, 0.11), 23.0, 30.0, ("metro", "metro_A6")),
+        # proportions of metro_A6 but for 2 %, and as many cars
+        (EqualCars(6, 0.709, 0.0945), 27.5, 16.0, ("metro_A6", "CRH3")),
+        # wagons as many as the coaches of ICE1, behind a locomotive
+        (EqualCars(12, 0.64, 0.128, front=1.37), 14.04, 40.0, ("ICE1", "CRH3")),
+    ],
+    ids=["four cars", "six long cars", "locomotive and wagons"],
+)
+def test_an_unlisted_train_is_told_as_unknown(
+    cars: EqualCars, length: float, speed: float, types: tuple[str, ...]
+) -> None:
+    """Some type of the catalogue repeats nearly alike at another speed."""
+    axles = length / CAR[0] * cars.train.axles
     x = recorded(BEFORE_S + axles / speed, 400.0, ("modes", speed), 0.02, 7)
-    types = Catalogue(tuple(SHIPPED[name] for name in ("metro", "metro_A6")), "two types")
-    event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], types))
+    some = Catalogue(tuple(SHIPPED[name] for name in types), "two types")
+    event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], some))
     assert event is not None
     assert event.values["type"] == "unknown"
     assert "axle_count" not in event.values
     assert "unknown_type" in event.quality
     found = speed_of(event)
-    # its size is not known, but for a fifth; what repeats is
-    assert found.sigma > 0.15 * speed
+    # its size is not known, but for a quarter; what repeats is
+    assert found.sigma > 0.24 * found.value
     assert abs(found.value - speed) < 2 * found.sigma
     rate = estimate(event, "car_rate")
-    assert rate.value == pytest.approx(speed / 23.0, rel=5e-3)
+    assert rate.value == pytest.approx(speed / length, rel=5e-3)
+
+
+@pytest.mark.parametrize("front", [0.0, 1.3])
+@pytest.mark.parametrize("centres", [0.7, 1.0])
+def test_the_cars_of_a_train_of_equal_cars_lie_where_it_says(centres: float, front: float) -> None:
+    """Wheelsets of the first and of the last equal car against their drawing."""
+    cars = EqualCars(5, centres, 0.1, front=front)
+    first, last = cars.ends
+    assert last - first == pytest.approx(5 * CAR[0])
+    axles = cars.train.axles - 0.5 * cars.train.span
+    run = axles[4:] if front else axles
+    edge = 0.5 * (1 - centres) * CAR[0]
+    assert run[0] == pytest.approx(first + edge - 0.05 * CAR[0])
+    assert run[-1] == pytest.approx(last - edge + 0.05 * CAR[0])
+
+
+def test_the_equal_cars_of_a_type_are_those_of_its_drawing() -> None:
+    found = like(SHIPPED["metro_A6"])
+    assert found is not None
+    cars, length = found
+    assert cars.cars == 6
+    assert length == pytest.approx(22.8)
+    assert (cars.centres, cars.base) == pytest.approx((15.7 / 22.8, 2.5 / 22.8))
+    found = like(SHIPPED["ICE1"])
+    assert found is not None
+    assert found[1] == pytest.approx(26.4)
+    assert found[0].centres == pytest.approx(19.0 / 26.4)
 
 
 def test_two_types_of_one_shape_are_equally_likely() -> None:

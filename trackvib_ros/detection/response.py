@@ -26,6 +26,7 @@ from .events import Channel
 from .evidence import PRIOR_UNKNOWN, half_interval
 from .kinematics import Motion
 from .record import Record
+from .response_equal import proportions, unlisted
 from .response_model import (
     USUAL_MISFIT,
     Observation,
@@ -43,7 +44,7 @@ from .response_search import (
     Search,
     distinct,
 )
-from .unlisted import ALTERNATIVES, CAR, CHOICES, NUMBERS_APART
+from .unlisted import ALTERNATIVES, CAR, CHOICES, NUMBERS_APART, WITH_POWER
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -90,7 +91,8 @@ class ResponsePassage:
         direction: +1, -1, or 0 if unknown.
         duration: between 5 and 95 % of the energy (s).
         spectral: speed by the bogie-passing spectrum (m/s), sigma; or None.
-        unlisted: the train of equal cars that explains most, at the speed of cars of 20 m.
+        unlisted: the train of equal cars that explains most, at the speed of cars of :data:`CAR`.
+        plain: the same without locomotives, by a first look.
         choice: ln of the mean over all proportions, the usual ones most, of what they explain, over
             the best ones'.
         types: number of types to choose from.
@@ -104,6 +106,7 @@ class ResponsePassage:
     duration: float
     spectral: tuple[float, float] | None
     unlisted: ResponseFit | None = None
+    plain: ResponseFit | None = None
     choice: float = 0.0
     types: int = 1
 
@@ -165,11 +168,14 @@ class ResponsePassage:
         Blows, rain or a hum can have some evidence too, but no common response explains three
         quarters of their waveform or of their energy, unless the evidence is overwhelming.
         """
-        return any(self._train(fit) for fit in (*self.fits[:1], self.unlisted) if fit)
+        return any(self._train(fit) for fit in (*self.fits[:1], self.plain) if fit)
 
     def _train(self, fit: ResponseFit) -> bool:
         common = fit.common or fit
-        chosen = CORRELATED * float(np.log(CHOICES)) if fit is self.unlisted else 0.0
+        choices = 1
+        if fit.cars is not None:
+            choices = CHOICES if fit is self.plain else CHOICES * WITH_POWER
+        chosen = CORRELATED * float(np.log(choices))
         evidence = common.evidence - chosen
         explained = min(model.unexplained for model in common.models) <= USUAL_MISFIT
         explained |= evidence > CERTAIN_EVIDENCE
@@ -302,12 +308,15 @@ def find_response(
     search = Search(seen, limits)
     coarse = search.scan(oriented)
     listed = search.refined(coarse) if any(fit.evidence > 0 for fit in coarse) else []
-    equal = search.unlisted()
-    others = [equal] if equal is not None else []
+    others = unlisted(search, listed)
     listed += search.transferred(oriented, [*listed[:2], *others])
     together = search.shared([*listed, *others])
     if not together or together[0].evidence < 0:
         return None
+    first = others[0].cars if others else None
+    plain = next((fit for fit in together if fit.cars is not None and fit.cars == first), None)
+    equal = next((fit for fit in together if fit.cars is not None), None)
+    together = [fit for fit in together if fit.cars is None or fit is equal]
     if together[0].evidence > CONFIRM_EVIDENCE:  # else no train is told
         together = search.varied(together)
     fits = [fit for fit in together if fit.cars is None]
@@ -315,7 +324,7 @@ def find_response(
     choice = 0.0
     if other is not None and other.cars is not None and other.common is not None:
         near = other.cars.proportions()
-        other, values = search.proportions(other, near)
+        other, values = proportions(search, other, near)
         gains = (values - values.max()) / tempered(float(values.max()))
         usual = np.array([cars.prior for cars in near])
         choice = float(np.log(usual @ np.exp(gains) / usual.sum()))
@@ -333,6 +342,7 @@ def find_response(
         search.duration,
         None,
         other,
+        plain,
         choice,
         len(trains),
     )

@@ -17,7 +17,7 @@ from .response_model import (
     Observation,
     Spectrum,
 )
-from .unlisted import CAR, EqualCars, starts
+from .unlisted import EqualCars
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -39,7 +39,7 @@ KEPT = 15.0
 _MOST_MISFIT, _LEAST_MISFIT = 0.5, 0.001  # part of the spectrum that no response explains
 _DEVIATIONS = 0.1, 0.3, 1.0  # power of what wheelsets of a car differ by, over the misfit
 _REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
-_MIDDLE, _FINE = 4.0, 2.0  # m, shortest waves that are compared, later
+_MIDDLE, FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
 _DECELERATION = 0.4  # of the speed, largest change over a passage
 _LARGEST = 1.0  # m/s²
@@ -52,8 +52,6 @@ _CLEAR = 20.0  # evidence of a motion without acceleration
 _MOST = 10  # hypotheses that are followed
 _VARIED = 6  # of them whose wheelsets may differ
 _PEAKS = 5  # of a type and orientation
-_CARS = (30.0, 13.5)  # m, longest and shortest cars, at the lowest and the highest speed
-_ABOUT = -0.12, 0.12  # ln of speed, range of a train of equal cars: one car of four
 
 
 @dataclass(frozen=True)
@@ -280,7 +278,7 @@ class Search:
         """The fit with the misfits of most evidence, of one octave after the other."""
         models = []
         for k, model in enumerate(fit.models):
-            combs, here = self._own(k, model, fit), np.array([model.centre])
+            combs, here = self.own(k, model, fit), np.array([model.centre])
             best, top = model, float(model.evidence(combs, fit.places.size, here)[0, 0])
             for octave, factor in itertools.product(range(OCTAVES), (0.5, 2.0)):
                 while True:
@@ -303,7 +301,7 @@ class Search:
         types must not be told apart by how well a search went.
         """
         trials = [[fit.models[k] for fit in fits] for k in range(len(self.seen))]
-        return self._sorted([self._suited(fit, trials, fits) for fit in fits])
+        return ranked([self._settled(self._suited(fit, trials, fits), FINE) for fit in fits])
 
     def varied(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """The likely ones of shared fits with wheelsets that may differ within a car.
@@ -320,7 +318,16 @@ class Search:
         near += rest[: _VARIED - len(near)]
         models = [self._deviating(fit) for fit in leaders.values()]
         trials = [[each[k] for each in models] for k in range(len(self.seen))]
-        return self._sorted([replace(self._suited(fit, trials, near), common=fit) for fit in near])
+        top: dict[bool, float] = {}
+        found = []
+        for fit in near:
+            moved = self.climb(self._suited(fit, trials, near), FINE, 2)
+            best = top[fit.cars is None] = max(moved.evidence, top.get(fit.cars is None, -np.inf))
+            # the maxima beside it are asked where they count
+            likely = moved.evidence > best - KEPT
+            beside = self.beside(moved, FINE) if likely else fit
+            found.append(replace(moved, covariance=beside.covariance, common=fit))
+        return ranked(found)
 
     def _deviating(self, fit: ResponseFit) -> list[Model]:
         """Its models with the deviations and misfits of most evidence.
@@ -354,13 +361,13 @@ class Search:
             distinct = {(m.before, m.after, m.misfit, m.deviation): m for m in each}
             placed = [self._placed(k, model, fit, centres) for model in distinct.values()]
             models.append(max(placed, key=lambda pair: pair[0])[1])
-        return self._settled(replace(fit, models=tuple(models)), _FINE)
+        return replace(fit, models=tuple(models))
 
     def _placed(
         self, k: int, model: Model, fit: ResponseFit, centres: Array
     ) -> tuple[float, Model]:
         """Evidence of a model for observation ``k`` at the best of its centres."""
-        values = model.evidence(self._own(k, model, fit), fit.places.size, centres)[0]
+        values = model.evidence(self.own(k, model, fit), fit.places.size, centres)[0]
         i = int(np.argmax(values))
         return float(values[i]), replace(model, centre=float(centres[i]))
 
@@ -369,10 +376,6 @@ class Search:
         moved = self.climb(fit, wave, 2)
         told = self.beside(moved, wave)
         return replace(moved, covariance=told.covariance)
-
-    @staticmethod
-    def _sorted(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
-        return sorted(fits, key=lambda fit: -fit.evidence)
 
     def transferred(
         self, oriented: Sequence[tuple[TrainType, bool]], fits: Sequence[ResponseFit]
@@ -383,7 +386,7 @@ class Search:
             best: ResponseFit | None = None
             for fit in fits:
                 ratio = train.span / fit.train.span
-                near = 1 + 0.12 * _FINE / train.span * np.arange(-4.0, 5.0, 2.0)
+                near = 1 + 0.12 * FINE / train.span * np.arange(-4.0, 5.0, 2.0)
                 v, a = ratio * fit.speed * near, np.full(near.size, ratio * fit.acceleration)
                 if not self.limits[0] <= ratio * fit.speed <= self.limits[1]:
                     continue
@@ -398,39 +401,6 @@ class Search:
         found.sort(key=lambda fit: -fit.evidence)
         return found[:_PEAKS]
 
-    def unlisted(self) -> ResponseFit | None:
-        """The train of equal cars that explains most; its speed is that of cars of 20 m."""
-        sizes = [limit * CAR[0] / length for limit, length in zip(self.limits, _CARS, strict=True)]
-        search = Search(self.seen, (sizes[0], sizes[1]))
-        found = []
-        for cars in starts():
-            near = search.coarse(cars.train, False, bent=False, spread=_ABOUT)
-            found += [(fit, cars) for fit in near[:1]]
-        if not found:
-            return None
-        fit, cars = max(found, key=lambda pair: pair[0].evidence)
-        fit = search.refined(search.coarse(cars.train, False, spread=_ABOUT)[:2] or [fit])[0]
-        for trials in (EqualCars.numbers, EqualCars.proportions, EqualCars.numbers):
-            v = fit.speed * (1 + 0.06 * _FINE / fit.train.span * np.arange(-2.0, 3.0, 2.0))
-            a = np.full(v.size, fit.acceleration)
-            values = [float(search.total(fit.of(trial), v, a).max()) for trial in trials(cars)]
-            cars = trials(cars)[int(np.argmax(values))]
-            fit = fit.of(cars)
-        return search.climb(search.weighted(search.climb(fit, _FINE, 2)), _FINE, 2)
-
-    def proportions(
-        self, fit: ResponseFit, trials: Sequence[EqualCars]
-    ) -> tuple[ResponseFit, Array]:
-        """The best of some trains of equal cars, and the evidence of all of them.
-
-        At the passing time of the fit.
-        """
-        v, a = np.array([fit.speed]), np.array([fit.acceleration])
-        near = [fit.of(trial) for trial in trials]
-        values = np.array([float(self.total(each, v, a)[0]) for each in near])
-        best = near[int(np.argmax(values))]
-        return replace(best, evidence=float(values.max())), values
-
     def passing(self, fit: ResponseFit, k: int, unit: float) -> tuple[float, float]:
         """When the middle of the train passes the channel of observation ``k`` (s), sigma.
 
@@ -442,7 +412,7 @@ class Search:
             unit: difference of evidence that stands for a factor e.
         """
         old = fit.models[k]
-        top, step = float(old.spectrum.f[-1]), _FINE / fit.speed
+        top, step = float(old.spectrum.f[-1]), FINE / fit.speed
         far = _REACHES[0] / fit.speed
         centres = old.centre + np.arange(-far, far + 0.5 * step, step)
         values, places, widths = [], [], []
@@ -450,7 +420,7 @@ class Search:
             before = reach / fit.speed
             spectrum = Spectrum(self.seen[k], 2 * before + ring, top)
             model = replace(old, spectrum=spectrum, before=before, after=before + ring)
-            combs = self._own(k, model, fit)
+            combs = self.own(k, model, fit)
             values.append(model.evidence(combs, fit.places.size, centres)[0])
             place, width = model.centroids(combs, fit.places.size, centres)
             places.append(place)
@@ -462,13 +432,14 @@ class Search:
         variance = float(weight @ ((place - mean) ** 2 + (_PLACED * width) ** 2))
         return old.spectrum.epoch + mean, float(np.sqrt(variance))
 
-    def _own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
+    def own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
+        """:meth:`combs` of the motion of a fit."""
         v, a = np.array([fit.speed]), np.array([fit.acceleration])
         return self.combs(k, model, fit.places, v, a)
 
     def refined(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """The likely ones of coarse fits on finer and finer waves, most probable first."""
-        for wave in (_MIDDLE, _FINE):
+        for wave in (_MIDDLE, FINE):
             best = max(fits, key=lambda fit: fit.evidence)
             kept = KEPT + (_BLUR * abs(best.evidence) if wave == _MIDDLE else 0.0)
             near = [fit for fit in fits if fit.evidence > best.evidence - kept]
@@ -479,7 +450,12 @@ class Search:
             for fit in near[:_MOST]:
                 moved = self.beside(self.adapted(fit, wave, best.speed), wave)
                 fits.append(self._settled(self.weighted(self.climb(moved, wave, 2)), wave))
-        return self._sorted(fits)
+        return ranked(fits)
+
+
+def ranked(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+    """Fits, most probable first."""
+    return sorted(fits, key=lambda fit: -fit.evidence)
 
 
 def distinct(fits: Sequence[ResponseFit]) -> list[ResponseFit]:
