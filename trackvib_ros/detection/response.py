@@ -66,6 +66,11 @@ that may differ within a car (of 16 passages of equal cars all but one within 6 
 HELD = 0.95
 """Probability that the family of a named type, and the interval of a speed, hold."""
 
+_REPEATED = 4, 3
+"""Equal cars at least, where everything else was chosen freely, and without locomotives: bursts of
+hum or of spikes look like two cars, or two cars and a locomotive, with an evidence of up to 370 (of
+30 disturbances of a minute)."""
+
 _TWO_SIDED = 1.96  # sigmas of a Gaussian that hold as much
 _SHORTEST_S = 0.3
 
@@ -121,6 +126,8 @@ class ResponsePassage:
         """
         if self.unlisted is None or not self.fits:
             return 0.0 if self.fits else 1.0
+        cars = self.unlisted.cars
+        choices = 1 if cars is None else cars.choices
         top = self.fits[0].evidence
         unit = tempered(top)
         listed = sum(np.exp((fit.evidence - top) / unit) for fit in self.fits) / self.types
@@ -129,6 +136,7 @@ class ResponsePassage:
         common = (self.unlisted.common or self.unlisted).evidence
         plain = (common - top) / tempered(top, False) - np.log(ALTERNATIVES)
         gain = max(gain, plain) if self.types > 1 else min(gain, plain)
+        gain -= float(np.log(choices))
         odds = PRIOR_UNKNOWN / (1 - PRIOR_UNKNOWN) * np.exp(min(gain, 50.0))
         return float(odds / (1 + odds))
 
@@ -168,13 +176,15 @@ class ResponsePassage:
         Blows, rain or a hum can have some evidence too, but no common response explains three
         quarters of their waveform or of their energy, unless the evidence is overwhelming.
         """
-        return any(self._train(fit) for fit in (*self.fits[:1], self.plain) if fit)
+        return any(self._train(fit) for fit in (*self.fits[:1], self.plain, self.unlisted) if fit)
 
     def _train(self, fit: ResponseFit) -> bool:
         common = fit.common or fit
         choices = 1
         if fit.cars is not None:
             choices = CHOICES if fit is self.plain else CHOICES * WITH_POWER
+            if fit.cars.cars < _REPEATED[fit is self.plain]:
+                return False
         chosen = CORRELATED * float(np.log(choices))
         evidence = common.evidence - chosen
         explained = min(model.unexplained for model in common.models) <= USUAL_MISFIT

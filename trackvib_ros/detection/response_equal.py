@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .kinematics import PRIOR_ACCELERATION
-from .response_search import FINE, PASSED, PASSED_SPREAD, ResponseFit, Search, ranked
+from .response_search import FINE, KEPT, PASSED, PASSED_SPREAD, ResponseFit, Search, ranked
 from .unlisted import CAR, EqualCars, like, starts
 
 Array = NDArray[np.float64]
 
-_CARS = (30.0, 12.0)  # m, longest and shortest cars, at the lowest and the highest speed
+_CARS = (30.0, 13.5)  # m, longest and shortest cars, at the lowest and the highest speed: no wagons
 _ABOUT = -0.12, 0.12  # ln of speed, range of a train of equal cars: one car of four
 _STARTS = 4  # trains to begin with, by a first look
 _LIKE = 3  # the same, by the cars of listed types
@@ -39,7 +39,7 @@ def unlisted(given: Search, listed: Sequence[ResponseFit]) -> list[ResponseFit]:
     Their speed is that of cars of :data:`CAR`. The second one, which may have a locomotive, is
     sought from the first and from the cars of the listed types that explain most: an unlisted train
     like one of them must not go by its name because it was not tried. That disturbances are no
-    trains is asked of the first one: the second is too free for it.
+    trains is asked of the first one, as the second one is freer, and of a long second one.
     """
     sizes = [limit * CAR[0] / length for limit, length in zip(given.limits, _CARS, strict=True)]
     search = Search(given.seen, (sizes[0], sizes[1]))
@@ -71,11 +71,12 @@ def unlisted(given: Search, listed: Sequence[ResponseFit]) -> list[ResponseFit]:
             pool.append(replace(fit.of(cars), speed=v, acceleration=a, reverse=False))
     pool = grown(search, pool)
     # a bogie in the middle of a car looks like shorter cars, and the other way round
-    pool += grown(search, [other for fit in pool[:1] for other in _harmonics(fit)])
+    pool += grown(search, [other for fit in pool[:1] for other in _harmonics(fit)], 1)
     if not pool:
         return []
     final = []
-    for fit in ranked(pool)[:2]:
+    pool = ranked(pool)
+    for fit in [f for f in pool[:2] if f.evidence > pool[0].evidence - KEPT]:
         fit = search.weighted(search.climb(fit, FINE, 2))
         final.append(search.climb(grown(search, [fit])[0], FINE, 2))
     return [*(plain or ranked(final)[:1]), ranked(final)[0]]
@@ -93,10 +94,10 @@ def _plain(search: Search, fit: ResponseFit) -> ResponseFit:
     return search.climb(search.weighted(search.climb(fit, FINE, 2)), FINE, 2)
 
 
-def grown(search: Search, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
+def grown(search: Search, fits: Sequence[ResponseFit], followed: int = _GROWN) -> list[ResponseFit]:
     """The trains of equal cars that one change of a kind after the other makes of some.
 
-    Of the likely ones only, most probable first.
+    Of the ``followed`` likely ones only, most probable first.
     """
     low, high = search.limits
     fits = [fit for fit in fits if low <= fit.speed <= high]
@@ -110,7 +111,7 @@ def grown(search: Search, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
             for fit in fits
             if fit.cars is not None
         ]
-        fits = ranked(fits)[:_GROWN]
+        fits = ranked(fits)[:followed]
     return list(fits)
 
 

@@ -132,6 +132,11 @@ class EqualCars:
         return [replace(self, centres=float(c), base=b) for c in centres for b in bases]
 
     @property
+    def choices(self) -> int:
+        """Kinds of trains among which this one was chosen: with power cars there are more."""
+        return WITH_POWER if self.front or self.rear else 1
+
+    @property
     def prior(self) -> float:
         """How usual these proportions are (not normalised): builders do not choose them freely."""
         if self.shared:
