@@ -375,6 +375,38 @@ def test_dead_sensor_is_told_and_not_used():
     assert passage.stamp_ns * 1e-9 == pytest.approx(truth.axle_times(20.0)[0], abs=5e-3)
 
 
+def behind(signals, late_s):
+    """Events of blocks of which those of the rails come later than the others."""
+    rail = {channel.name for channel in DEMO if channel.layer == "rail"}
+    parts = blocks(signals, 0.2)
+    late = {id(b): round(1e9 * late_s(b.stamp_ns)) for b in parts if rail & set(b.channels)}
+    detector = TrainDetector(DEMO)
+    events = []
+    for block in sorted(parts, key=lambda b: b.stamp_ns + late.get(id(b), 0)):
+        events += detector.process(block)
+    return events + detector.finish()
+
+
+def test_rails_that_come_late_are_waited_for():
+    truth = Passage(CATALOGUE["CRH3"].axles, 60.0, start=3.0)
+    signals = record([truth], DEMO, 30)
+    (passage,) = passages(events := behind(signals, lambda _: 1.6))
+    (same,) = passages(behind(signals, lambda _: 0.0))
+    assert not of(events, "health")
+    # frames end at other times of the other groups, noise floors differ by so much
+    assert abs(passage.stamp_ns - same.stamp_ns) < 1e6 * same.sigma_s
+    assert passage.values["types"][0][0] == "CRH3"
+
+
+def test_what_comes_too_late_is_told_to():
+    signals = record([], DEMO, 30, duration=12.0)
+    # it catches up from 5 s on
+    events = behind(signals, lambda stamp_ns: 4.0 - 0.8 * min(max(stamp_ns * 1e-9 - 5.0, 0.0), 5.0))
+    told = {(e.sensors[0], e.values["state"], e.values["present"]) for e in events}
+    rail = {channel.name for channel in DEMO if channel.layer == "rail"}
+    assert told == {(name, "late", present) for name in rail for present in ("yes", "no")}
+
+
 def test_dropped_out_sensor_is_told():
     def change(name, rate, x):
         if name == "rail_b":

@@ -17,7 +17,14 @@ from . import report
 from .calibration import Calibration
 from .catalogue import Catalogue
 from .closing import Closing, Ended
-from .events import POSITION_SIGMA, Channel, TrainEvent, check_position_sigma
+from .events import (
+    POSITION_SIGMA,
+    Channel,
+    Estimate,
+    TrainEvent,
+    Value,
+    check_position_sigma,
+)
 from .group import LEAST_BINS, Group
 from .head import HeadMatcher
 from .kinematics import Motion
@@ -57,7 +64,8 @@ class DetectorConfig:
         hang: quiet time that ends an event at the latest (s); longer than the time between two
             bogies of a car at ``min_speed``. A train whose bogies follow faster ends sooner.
         max_event: an event longer than this is a changed noise level, not a train (s).
-        max_lag: a group this far behind the others is taken for silent (s).
+        max_lag: a group this far behind the others is taken for silent, and not waited for (s).
+            What it sends nevertheless is told as ``late``, and used where nothing is told yet.
         position_sigma: standard uncertainty (m) of the positions of channels that come without
             one (:attr:`Channel.position_sigma`).
     """
@@ -66,7 +74,7 @@ class DetectorConfig:
     max_speed: float = 115.0
     hang: float = 1.8
     max_event: float = 90.0
-    max_lag: float = 1.0
+    max_lag: float = 3.0
     position_sigma: float = POSITION_SIGMA
 
     def __post_init__(self) -> None:
@@ -159,6 +167,7 @@ class TrainDetector:
         self._closing = Closing(self.channels, self.catalogue, self._limits, self._given)
         self._groups: dict[tuple[str, ...], Group] = {}
         self._start_ns: int | None = None
+        self._newest_ns = -(2**62)
         self._done_ns = 0
         self._event: _Event | None = None
         self._beginning = True
@@ -192,7 +201,7 @@ class TrainDetector:
         if self._start_ns is None:
             self._start_ns = self._done_ns = block.stamp_ns
         group.stream.push(block)
-        return self._run(self._horizon(block.stamp_ns))
+        return [*self._lateness(group, block), *self._run(self._horizon(block.stamp_ns))]
 
     def finish(self) -> list[TrainEvent]:
         """End of the stream: events of a train still passing, flagged ``truncated_end``."""
@@ -248,6 +257,18 @@ class TrainDetector:
     @property
     def _keep_s(self) -> float:
         return self.config.max_event + self.config.hang + 5.0
+
+    def _lateness(self, group: Group, block: Waveform) -> list[TrainEvent]:
+        """Tell if a group sends what others have not been kept waiting for."""
+        self._newest_ns = max(self._newest_ns, block.stamp_ns)
+        behind = (self._newest_ns - block.end_ns) * 1e-9
+        late = behind > (0.5 if group.late else 1.0) * self.config.max_lag
+        if late == group.late:
+            return []
+        group.late = late
+        values: dict[str, Value] = {"behind": Estimate(behind, block.dt_ns * 1e-9, "s")}
+        tell = self._closing.health.tell
+        return [e for c in block.channels for e in tell(self._newest_ns, c, "late", late, values)]
 
     def _horizon(self, newest_ns: int) -> int:
         """Time up to which every group that is not silent has come."""
@@ -352,11 +373,14 @@ class TrainDetector:
         self._active_ns[:] = -(2**62)
 
     def _open(self, now_ns: int, group: Group, local: int, best: int) -> list[TrainEvent]:
-        """An event begins where energy rises, unless an earlier train rings on."""
+        """An event begins where energy rises, unless an earlier train rings on.
+
+        What comes too late may have been told by others.
+        """
         channel = group.index[local]
-        if self._event is not None or not self._fresh(
-            channel, float(group.trigger.level[local]), now_ns
-        ):
+        if self._event is not None or group.late:
+            return []
+        if not self._fresh(channel, float(group.trigger.level[local]), now_ns):
             return []
         band, gain = divmod(best, len(GAINS))
         start = now_ns - round((group.stream.step + group.stream.shift[band]) * 1e9)

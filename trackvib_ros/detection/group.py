@@ -31,6 +31,7 @@ class Group:
         next_bin: first bin of the next decision frame.
         calm_s: for how long it has been much quieter than when its noise floor was learned (s).
         watching: whether an onset is looked for.
+        late: whether it sends what others have not been kept waiting for.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Group:
         self.trigger = self._trigger()
         self.onset = Onset(len(index), len(self.stream.bands), self.stream.step, sharing)
         self.watching = True
+        self.late = False
 
     def _trigger(self) -> Trigger:
         stream = self.stream

@@ -44,8 +44,9 @@ class HealthBook:
     """States of all channels; every change is an event.
 
     States: ``dead`` (the value stands still), ``dropped_out`` (most samples missing), ``drifting``
-    (the mean leaves its place), and from passages ``clipped``, ``unsynchronised``, ``moved`` (not
-    where it is said to be), ``swapped`` and ``insensitive`` (a train passed unnoticed).
+    (the mean leaves its place), ``late`` (comes when the others no longer wait for it), and from
+    passages ``clipped``, ``unsynchronised``, ``moved`` (not where it is said to be), ``swapped``
+    and ``insensitive`` (a train passed unnoticed).
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
@@ -113,7 +114,7 @@ class HealthBook:
     def tell(
         self, now_ns: int, name: str, state: str, present: bool, values: dict[str, Value]
     ) -> list[TrainEvent]:
-        """A state seen in a passage."""
+        """A state that others have seen, as in a passage."""
         index = [c.name for c in self._channels].index(name)
         if present == (state in self._states[index]):
             return []
@@ -136,7 +137,7 @@ class HealthBook:
                 sigma_s=_WINDOW_S,
                 confidence=0.95,
                 method="watching the samples"
-                if state in ("dead", "dropped_out", "drifting")
+                if state in ("dead", "dropped_out", "drifting", "late")
                 else "comparing channels in a passage",
                 sensors=(name,),
                 values={"state": state, "present": "yes" if present else "no", **(values or {})},
