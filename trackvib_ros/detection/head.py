@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from .catalogue import TrainType
 from .pattern import Trace
+from .strength import STRONG
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ MOST_UNCERTAIN = 0.15
 _CELL = 0.5  # m
 _WIDTH = 0.8  # m, of a wheelset in the smoothed energy
 _BEFORE, _AFTER = 6.0, 8.0  # m of quiet about a train that belongs to its pattern
+_WHEELSETS = 95  # per cent of the bins of a passing train are weaker than its strong wheelsets
 _OFFSETS = np.arange(-4.0, 4.01, 0.5)  # m, first strong energy is only near the first wheelset
 _SPEED_STEP = 0.012
 _INDEPENDENT = 2.5  # m between independent values of the smoothed energy
@@ -109,13 +111,17 @@ class HeadMatcher:
         if now - start < 0.1:
             return None
         score = np.zeros((self.speeds.size, len(self.combs)))
+        # weaker energy is what the rail carries between bogies and ahead of the train
+        passing = trace.energy[(trace.time >= start) & (trace.time <= now)]
+        strong = float(np.percentile(passing, _WHEELSETS)) if passing.size else 0.0
+        least = float(np.log(max(STRONG * strong / trace.base, 1.0)))
         for i, speed in enumerate(self.speeds):
             count = int((speed * (now - start) + _BEFORE) / _CELL)
             count = min(count, self.place.size)
             if count < 16:
                 continue
             edges = start + (np.arange(count + 1) * _CELL - _BEFORE) / speed
-            level = trace.levels(edges)
+            level = np.maximum(trace.levels(edges), least)
             level = np.convolve(np.pad(level, 4, mode="edge"), self._kernel, mode="valid")
             level = level - level.mean()
             own = float(level @ level)
