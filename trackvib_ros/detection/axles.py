@@ -246,21 +246,40 @@ def refit(fit: AxleFit, places: Sequence[Array]) -> AxleFit:
     )
 
 
-def fit_axles(
-    traces: Sequence[Trace],
-    places: Sequence[Array],
-    start: Motion,
-    anchors: Sequence[Trace],
-    waves: Sequence[Wave],
-) -> AxleFit:
-    """Times of the wheelsets of a train at every rail channel, and its motion.
+@dataclass(frozen=True)
+class Timed:
+    """Wheelsets of one type by the energy of their pulses.
+
+    Arrays have shape (channels, wheelsets): time (s), contrast and observed as in :class:`AxleFit`.
+
+    Attributes:
+        start: rough motion, good to about 1 m everywhere.
+        fit: the motion by these times; ``None`` if they are of no train.
+        places: per channel, distance (m) at which each wheelset passes it.
+        reach: how far from its place a wheelset was looked for (m).
+    """
+
+    start: Motion
+    fit: Fit | None
+    time: Array
+    contrast: Array
+    observed: NDArray[np.bool_]
+    places: tuple[Array, ...]
+    reach: float
+
+    @property
+    def close(self) -> bool:
+        """Whether the wheelsets are where the type has them: deflections need not be asked."""
+        return self.fit is not None and self.fit.scale <= _CLOSE
+
+
+def timed(traces: Sequence[Trace], places: Sequence[Array], start: Motion) -> Timed:
+    """Times of the wheelsets of a train at every rail channel, by their energy.
 
     Args:
         traces: rail channels.
         places: per trace, distance s (m) at which each wheelset passes it.
         start: rough motion, good to about 1 m everywhere.
-        anchors: the same channels in their lowest band, where the rail bends under the wheel.
-        waves: their low-passed waveforms.
     """
     motion = start
     count = places[0].size
@@ -270,7 +289,6 @@ def fit_axles(
     half = _HALF + 0.6
     classes = _neighbours(places[0])
     fit: Fit | None = None
-    channel = np.zeros(0, dtype=np.int64)
     shape = (len(traces), count)
     time, contrast = np.zeros(shape), np.zeros(shape)
     observed = np.zeros(shape, dtype=bool)
@@ -314,11 +332,35 @@ def fit_axles(
         if motion.speed < 1.0:
             fit = None
             break
+    return Timed(start, fit, time, contrast, observed, tuple(places), reach)
+
+
+def fit_axles(
+    traces: Sequence[Trace],
+    found: Timed,
+    anchors: Sequence[Trace],
+    waves: Sequence[Wave],
+    deflected: bool,
+) -> AxleFit:
+    """Times of the wheelsets of a train where their deflection shows them, and its motion.
+
+    Args:
+        traces: rail channels.
+        found: wheelsets by their energy.
+        anchors: the same channels in their lowest band, where the rail bends under the wheel.
+        waves: their low-passed waveforms.
+        deflected: whether energies tell of no type where its wheelsets are. The times of types are
+            compared: a type that energies refuse must not be timed by what others are not.
+    """
+    fit, places = found.fit, found.places
+    motion = found.start if fit is None else fit.motion
+    time, observed = found.time.copy(), found.observed
+    classes = _neighbours(places[0])
     place = np.diag(np.full(len(traces), np.inf))
-    residual = np.zeros(shape)
+    residual = np.zeros(observed.shape)
     bent, in_phase = None, 0.0
-    if fit is not None and fit.scale > _CLOSE:
-        bent = _by_deflection(waves, places, start, observed, fit.scale)
+    if fit is not None and deflected:
+        bent = _by_deflection(waves, places, found.start, observed, fit.scale)
         if bent is not None:
             time, motion, in_phase = bent
     if fit is not None:
@@ -327,16 +369,15 @@ def fit_axles(
         pace = np.maximum(motion.speed_at(due), 0.5)
         tables = []
         for k, trace in enumerate(anchors):
-            if bent is not None:
-                tables.append(likelihood(waves[k], motion, places[k]))
-                continue
-            found = _centre(trace, motion, places[k], classes, 1.0)
-            if found is None or found[1] < _MIRROR_RISE:
-                found = _centre(traces[k], motion, places[k], classes, reach)
-            else:
-                scales[k] = _PLACE_LOW
-            if found is not None:
-                time[k] += found[0] / pace[k]
+            centre = None
+            if bent is None:
+                centre = _centre(trace, motion, places[k], classes, 1.0)
+                if centre is None or centre[1] < _MIRROR_RISE:
+                    centre = _centre(traces[k], motion, places[k], classes, found.reach)
+                else:
+                    scales[k] = _PLACE_LOW
+            if centre is not None:
+                time[k] += centre[0] / pace[k]
             seen = observed[k] if observed[k].any() else slice(None)
             late = float(np.median(((time[k] - due[k]) * pace[k])[seen]))
             tables.append(likelihood(waves[k], motion, places[k] + late))
@@ -346,7 +387,7 @@ def fit_axles(
         fit = regress(
             time[observed],
             np.stack(list(places))[observed],
-            channel,
+            np.nonzero(observed)[0],
             motion.epoch,
             position_sigma=_position(place),
         )
@@ -356,7 +397,7 @@ def fit_axles(
         scale=fit.scale if fit is not None else float("inf"),
         time=time,
         residual=residual,
-        contrast=contrast,
+        contrast=found.contrast,
         observed=observed,
         offset=fit.offset if fit is not None else np.zeros(len(traces)),
         place=place,

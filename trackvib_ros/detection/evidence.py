@@ -63,6 +63,8 @@ _LEAST_SHARE = 0.6  # of the scatter about the best type that must be noise
 _NULL_LOG = float(np.log(2.2))  # a wheelset found anywhere within its window of 2.2 m
 _SCORE_WEIGHT = 120.0
 _SCORE_NOISE = 0.03  # scores of equally right types differ by this much
+LIKELY = 2 * _SCORE_NOISE
+"""Of score, behind the best, at which a type may well be right."""
 
 
 @dataclass(frozen=True)
@@ -264,7 +266,7 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
     if not candidates:
         return []
     top = max(c.score for c in candidates)
-    likely = [c for c in candidates if c.score > top - 2 * _SCORE_NOISE]
+    likely = [c for c in candidates if c.score > top - LIKELY]
     # classes of few wheelsets understate it
     noise = max(min(_noise(c) for c in likely), _LEAST_SHARE * min(c.fit.scale for c in likely))
     speed = max(likely, key=lambda c: c.score).fit.motion.speed

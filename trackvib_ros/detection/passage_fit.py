@@ -8,19 +8,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .axles import AxleFit, fit_axles, refit
+from .axles import AxleFit, Timed, fit_axles, refit, timed
 from .calibration import Calibration, Measured
 from .catalogue import TrainType
-from .evidence import LISTED, Candidate, Explanation, Kind, clock_density, explain
+from .evidence import LIKELY, LISTED, Candidate, Explanation, Kind, clock_density, explain
 from .kinematics import Motion, robust_scale
 from .passage import Hypothesis, Passage
 from .passage_scan import Scanned, recentred, see
+from .pattern import Match
 
 Array = NDArray[np.float64]
 
 CERTAIN = 0.99
 """Probability of a type, by its pattern alone, that teaches where the channels are."""
 
+_HOPELESS = 0.25  # of score, behind the best type
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
 _UNSTATED = 5.0  # m, distance between channels of no use
 
@@ -43,31 +45,28 @@ def fit_hypotheses(
     seen = see(usable, trains, limits)
     direction, kept = seen.direction, seen.kept
     fitted: list[Hypothesis] = []
-    aligned: list[list[Array]] = []
+    aligned: list[Sequence[Array]] = []
     names = tuple(s.trace.name for s, _ in kept)
     stated = np.array([s.trace.x - reference.trace.x for s, _ in kept])
     offset, covariance = site.relative(names)
     shifts = (direction or 1) * (stated + offset)
+    rails, waves = [s.trace for s, _ in kept], tuple(s.wave for s, _ in kept)
+    rough: list[tuple[Match, Timed]] = []
     for match in seen.matches:
-        score = match.score
-        if score < seen.matches[0].score - 0.25:
+        if match.score < seen.matches[0].score - _HOPELESS:
             continue
+        # where the pattern was seen; whether the distance agrees is for the evidence to say
         places = match.train.oriented(match.reverse)
-        aligned.append([places + delay * match.speed for _, delay in kept])
-        fit = fit_axles(
-            [s.trace for s, _ in kept],
-            # where the pattern was seen; whether the distance agrees is for the evidence to say
-            aligned[-1],
-            recentred(match),
-            [s.low for s, _ in kept],
-            [s.wave for s, _ in kept],
-        )
-        if not np.isfinite(fit.scale) or not 0.5 * match.speed < fit.motion.speed:
-            aligned.pop()
-            continue
-        fitted.append(Hypothesis(match.train, match.reverse, direction, score, fit))
+        own = [places + delay * match.speed for _, delay in kept]
+        rough.append((match, timed(rails, own, recentred(match))))
+    likely = [t for match, t in rough if match.score > seen.matches[0].score - LIKELY]
+    deflected = not any(t.close for t in likely)
+    for match, found in rough:
+        fit = fit_axles(rails, found, [s.low for s, _ in kept], waves, deflected)
+        if np.isfinite(fit.scale) and 0.5 * match.speed < fit.motion.speed:
+            aligned.append(found.places)
+            fitted.append(Hypothesis(match.train, match.reverse, direction, match.score, fit))
     fitted = _same_times(fitted, aligned)
-    waves = tuple(s.wave for s, _ in kept)
     candidates = [Candidate(h.places, shifts, h.fit, h.score, covariance, waves) for h in fitted]
     explanations = explain(candidates)
     off, moved = _wrong(explanations, "clock"), _wrong(explanations, "moved")
