@@ -12,7 +12,7 @@ from . import travel
 from .bowl import WAVENUMBER, corner
 from .calibration import Calibration
 from .kinematics import Motion
-from .place import Wave, likelihood, locate
+from .place import STIFFNESS, Wave, likelihood, locate
 from .record import Record
 from .single import HUMP, HUMP_FINE, Shown, alone, log_energy
 from .travel import Pair, Travel
@@ -25,7 +25,6 @@ CONFIDENT = 0.8
 
 
 _PULSE_CELLS = 60  # of :data:`travel.CELL`
-_BEAM = 1.2  # 1/m, sqrt^4(k/4EI) of a rail on fastenings of 40 to 100 kN/mm every 0.65 m
 _EXPLAINED = 0.9  # of a signal's variance, at which no other is needed
 _BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other, usual 1
 _PARTNER = 3.6  # m, the other wheelset of a bogie, or of the next one
@@ -37,7 +36,7 @@ _AMONG = (2.0, 60.0)  # Hz, in which those of a type are compared with others
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
 _BOGIE = 2  # wheelsets
 _SHOWN = 0.9  # of the two metres about a wheelset, to be measured
-_SHAPE = 0.03  # m, of both wheelsets of a bogie against each other: by the shape of their pulse
+_SHAPE = 0.012  # m, of wheelsets against each other, by the shape of their pulse: computed at 40 dB
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
 
@@ -183,31 +182,33 @@ def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
 
     Strong energy that no wheelset explains is one that was missed, if it lasts for longer than the
     longest gap of the train. Where the number of wheelsets is in doubt, that which the rail carries
-    is one too, and one beyond the strong energy may be none.
+    is one too, one beyond the strong energy may be none, and a whole gap may be missing.
     """
-    carried = float(np.max(np.diff(blind.times))) if blind.regular >= CONFIDENT else 0.0
+    longest = float(np.max(np.diff(blind.times)))
+    sure = blind.regular >= CONFIDENT
+    doubt = 0.0 if sure else float((1 - blind.regular) ** 0.5) * longest
     sigma = blind.time_sigma.copy()
     for k, missed in (
         (0, float(blind.times[0]) - interval[0]),
         (-1, interval[1] - float(blind.times[-1])),
     ):
-        doubt = missed if blind.regular >= CONFIDENT else abs(missed)
-        sigma[k] = np.hypot(sigma[k], doubt if doubt > carried else 0.0)
+        off = abs(missed) if not sure or missed > longest else 0.0
+        sigma[k] = np.sqrt(sigma[k] ** 2 + off**2 + doubt**2)
     return replace(blind, time_sigma=sigma)
 
 
 def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
     """Waveforms, then log-energies per band, of both channels over distance; the first guess of a
-    wheelset's pulse in them."""
+    wheelset's pulse in them, or what it is a mixture of."""
     edges = pair.edges(found.motion, found.direction)
     lag = np.arange(-_PULSE_CELLS, _PULSE_CELLS + 1) * travel.CELL
-    curve = _BEAM * np.abs(lag)
+    curve = 0.5**0.5 * np.outer(STIFFNESS, np.abs(lag))
     bending = np.exp(-curve) * (np.cos(curve) - np.sin(curve))
     waves = [wave.cells(e) for wave, e in zip(pair.waves, edges, strict=True)]
-    first, second, pulse = (
+    first, second, family = (
         travel.band_pass(x, travel.FINE, travel.BROAD) for x in (*waves, bending)
     )
-    out = [(first, second, pulse)]
+    out: list[tuple[Array, Array, Array]] = [(first, second, family)]
     hump = travel.band_pass(np.exp(-0.5 * (lag / HUMP) ** 2), HUMP_FINE, travel.BROAD)
     for two in zip(*pair.traces, strict=True):
         first, second = (
@@ -237,7 +238,8 @@ def _two_channels(
     best: tuple[Wheelsets, Array, Array] | None = None
     for first, second, pulse in _signals(pair, found):
         sign = 1.0 if first @ second >= 0 else -1.0
-        wheelsets = find(0.5 * (first + sign * second), 0.5 * (first - sign * second), pulse)
+        mean, half = 0.5 * (first + sign * second), 0.5 * (first - sign * second)
+        wheelsets = find(mean, half, pulse)
         if wheelsets is not None and (best is None or wheelsets.explained > best[0].explained):
             best = (wheelsets, first, sign * second)
         if best is not None and best[0].explained > _EXPLAINED:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.special import expit
+from scipy.special import expit, logsumexp
 
 from .kinematics import Motion
 
@@ -36,9 +36,11 @@ REACH = 2.5
 
 _STEP = 0.1  # m
 _WAVENUMBERS = (1.0, 5.0)  # rad/m: shorter waves are roughness, longer ones the bridge and the cars
-# rad/m, k0 = (foundation / bending stiffness)^(1/4), 1.2 to 1.9 on ballastless track; any even
-# pulse is made of three. What of a clipped one, which is flatter, is left above
-_STIFFNESS, _TOP_CLIPPED = (0.9, 1.4, 2.2), 7.0
+# rad/m, k0 = (foundation / bending stiffness)^(1/4), on ballastless track, equally likely
+_STIFFNESS = (1.2, 1.35, 1.5, 1.7, 1.9)
+STIFFNESS = (0.9, 1.4, 2.2)
+"""Of pulses that any even one, of a clipped channel, too, is made of (rad/m)."""
+_TOP_CLIPPED = 7.0  # rad/m: clipping flattens a pulse, what of it is left is above
 _TAPER = 8.0  # m beyond the outer wheelsets
 _COUPLINGS = np.arange(0.0, 3.01, 0.5)  # Hz, edges of the AC coupling of accelerometers
 _SHIFTS = np.arange(-REACH, REACH + 0.01, 0.02)
@@ -199,17 +201,22 @@ def likelihood(wave: Wave, motion: Motion, places: Array) -> Array:
     k, seen, independent = found
     energy = float(np.sum(np.abs(seen) ** 2))
     comb = np.exp(-1j * np.outer(k, places - places[0])).sum(axis=1)
-    pulses = comb * k**2 / (1 + (k / np.array(_STIFFNESS)[:, None]) ** 4)
+    stiffness = np.array(STIFFNESS if wave.clipped else _STIFFNESS)
+    pulses = comb * k**2 / (1 + (k / stiffness[:, None]) ** 4)
     frequency = k * _mid_speed(motion, places) / (2 * np.pi)
     turned = seen[:, None] * np.exp(1j * np.outer(k, _SHIFTS))
     for row, edge in zip(flat, _COUPLINGS, strict=True):
         lead = 1j * frequency / (1j * frequency + edge)
         template = pulses * (lead / np.maximum(np.abs(lead), 1e-12))
-        normal = np.real(template.conj() @ template.T)
-        normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
         projection = np.real(template.conj() @ turned)
-        explained = np.sum(projection * np.linalg.solve(normal, projection), axis=0)
-        row[:] = -independent * np.log(np.maximum(1 - explained / energy, _LEAST))
+        normal = np.real(template.conj() @ template.T)
+        if wave.clipped:
+            normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
+            explained = np.sum(projection * np.linalg.solve(normal, projection), axis=0)[None]
+        else:
+            explained = projection**2 / np.diag(normal)[:, None]
+        log = -independent * np.log(np.maximum(1 - explained / energy, _LEAST))
+        row[:] = logsumexp(log, axis=0) - np.log(len(log))
     return flat
 
 

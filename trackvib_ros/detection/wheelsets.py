@@ -108,6 +108,15 @@ def _learnt(y: Array, places: Array, heights: Array, pulse: Array) -> Array:
     return np.asarray(learnt * taper)
 
 
+def _mixed(y: Array, places: Array, heights: Array, family: Array) -> Array:
+    """The pulse of the record among mixtures of a family, by least squares.
+
+    A free one takes up what its places are off: of equal bogies any wheelbase has its pulse.
+    """
+    columns = np.stack([_shifted(shape, places, y.size) @ heights for shape in family], axis=1)
+    return np.asarray(np.linalg.lstsq(columns, y, rcond=None)[0] @ family)
+
+
 class _Chain:
     """Scores of all places, and the best or drawn paths through them."""
 
@@ -240,6 +249,23 @@ def _left(rest: Array, r: Array, places: Array) -> float:
     return float(np.sqrt(np.mean(part**2) / freedom))
 
 
+def _begun(
+    y: Array, noise: Array | None, pulse: Array
+) -> tuple[Array, float, Array, Array, Array] | None:
+    """First wheelsets by a pulse: it at unit energy, the noise of its estimate, places (cells),
+    heights, rest."""
+    pulse = pulse / np.sqrt(float(pulse @ pulse))
+    output = np.asarray(np.convolve(y, pulse[::-1], "same"))
+    least = 1.4826 * float(np.median(np.abs(output)))
+    if noise is not None:
+        least = float(np.std(np.convolve(noise, pulse[::-1], "same")))
+    overlap = np.asarray(np.correlate(pulse, pulse, "full")[pulse.size - 1 :])
+    start, _ = _pursued(output, overlap, least)
+    if start.size < 2:
+        return None
+    return pulse, least, *_fitted(y, pulse, np.sort(start).astype(float))
+
+
 def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
     """The wheelsets in a signal.
 
@@ -247,11 +273,17 @@ def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
         y: over distance, spacing :data:`CELL`, shape (cells,).
         noise: what of it is known to be noise, the same shape: half the difference of two records;
             ``None`` where nothing is known but what the wheelsets leave.
-        pulse: first guess, odd number of cells.
+        pulse: first guess, odd number of cells; or several, shape (shapes, cells), that the pulse
+            is a mixture of.
     """
     half = round(_HALF / CELL)
-    middle = pulse.size // 2
-    pulse = pulse[middle - half : middle + half + 1] / np.sqrt(float(pulse @ pulse))
+    middle = pulse.shape[-1] // 2
+    family = np.atleast_2d(pulse)[:, middle - half : middle + half + 1]
+    begun = [found for shape in family if (found := _begun(y, noise, shape)) is not None]
+    if not begun:
+        return None
+    pulse, least, places, q, rest = min(begun, key=lambda found: float(found[-1] @ found[-1]))
+    height = float(np.median(q))
 
     def filtered(x: Array) -> Array:
         return np.asarray(np.convolve(x, pulse[::-1], "same"))
@@ -262,19 +294,12 @@ def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
     def doubt(rest: Array) -> float:
         return float(np.std(filtered(rest if noise is None else noise)))
 
-    output = filtered(y)
-    least = doubt(y)
-    if noise is None:
-        least = 1.4826 * float(np.median(np.abs(output)))
-    start, q = _pursued(output, overlap(), least)
-    if start.size < 2:
-        return None
-    order = np.argsort(start)
-    places, q, rest = _fitted(y, pulse, start[order].astype(float))
-    height = float(np.median(q))
     for round_ in range(_ROUNDS):
-        if round_ == 0 and height > _LEARN_CONTRAST * least:
-            pulse = _learnt(y, places, q, pulse)
+        if height > _LEARN_CONTRAST * least and (round_ == 0 or len(family) > 1):
+            if len(family) > 1:
+                pulse = _mixed(y, places, q, family)
+            else:
+                pulse = _learnt(y, places, q, pulse)
             pulse = pulse / np.sqrt(float(pulse @ pulse))
             places, q, rest = _fitted(y, pulse, places)
         deviation = float(np.hypot(doubt(rest), _MISFIT * height))
@@ -286,12 +311,15 @@ def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
         places, q, rest = _fitted(y, pulse, path.astype(float) * _STEP)
         height = float(np.median(q))
     numbers = chain.numbers(_PATHS, np.random.default_rng(0))
-    slope = float(np.sqrt(np.gradient(pulse) @ np.gradient(pulse)))
-    left = _left(filtered(rest), overlap(), places)
+    slope = np.gradient(pulse)
+    steep = float(np.sqrt(slope @ slope))
+    # what moves a wheelset is noise of the shape of its pulse's slope
+    pushed = np.convolve(rest, slope[::-1] / steep, "same")
+    left = _left(np.asarray(pushed), overlap(), places)
     return Wheelsets(
         place=places * CELL,
         level=q / height,
-        sigma=CELL * left / (slope * np.maximum(q, 0.2 * height)),
+        sigma=CELL * left / (steep * np.maximum(q, 0.2 * height)),
         contrast=height / deviation,
         certainty=float(np.mean(numbers == places.size)),
         explained=float(1 - rest @ rest / (y @ y)),
