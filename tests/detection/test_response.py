@@ -250,10 +250,16 @@ def test_an_unlisted_train_is_told_as_unknown(
     axles = length / CAR[0] * cars.train.axles
     x = recorded(BEFORE_S + axles / speed, 400.0, ("modes", speed), 0.02, 7)
     some = Catalogue(tuple(SHIPPED[name] for name in types), "two types")
-    event = passage(detect(400.0, x, [Channel("b", 0.0, "bridge")], some))
+    events = detect(400.0, x, [Channel("b", 0.0, "bridge")], some)
+    event = passage(events)
     assert event is not None
     assert event.values["type"] == "unknown"
     assert "axle_count" not in event.values
+    left = next(event for event in events if event.kind == "departure")
+    # one of three beyond 2.5 sigma would be an accident in 80
+    assert abs(left.stamp_ns * 1e-9 - BEFORE_S - axles[-1] / speed) < 2.5 * left.sigma_s
+    # the vehicles at its ends may be others, by half a car: 0.29 cars
+    assert left.sigma_s > 0.25 * length / speed
     assert "unknown_type" in event.quality
     found = speed_of(event)
     # its size is not known, but for a quarter; what repeats is

@@ -26,7 +26,7 @@ from .events import Channel
 from .evidence import PRIOR_UNKNOWN, half_interval
 from .kinematics import Motion
 from .record import Record
-from .response_equal import proportions, unlisted
+from .response_equal import ends_sigma, proportions, unlisted
 from .response_model import (
     USUAL_MISFIT,
     Observation,
@@ -193,12 +193,18 @@ class ResponsePassage:
         return clear and explained and common.alike
 
     @property
+    def unit(self) -> float:
+        """What counts as one of correlated misfits; a train of equal cars is only like the true
+        one."""
+        return CORRELATED if self.listed else tempered(self.best.evidence)
+
+    @property
     def motion(self) -> Motion:
         """Of the first wheelset past the reference, with what correlated misfit adds."""
         best = self.best
         covariance = np.zeros((3, 3))
         if best.covariance is not None:
-            covariance[1:, 1:] = CORRELATED * best.covariance
+            covariance[1:, 1:] = self.unit * best.covariance
         covariance[0, 0] = (self.middle[1] * best.speed) ** 2
         if not self.listed:
             covariance[1, 1] += (CAR[1] * best.speed) ** 2
@@ -209,7 +215,7 @@ class ResponsePassage:
     def relative(self) -> float:
         """Relative sigma of the time that the train takes, whatever its size."""
         best = self.best
-        own = CORRELATED * best.covariance[0, 0] if best.covariance is not None else 0.0
+        own = self.unit * best.covariance[0, 0] if best.covariance is not None else 0.0
         variance = float(own) / best.speed**2
         if self.listed:
             rate = best.speed / best.train.span
@@ -356,12 +362,17 @@ def find_response(
         choice,
         len(trains),
     )
-    # a train of equal cars is only like the true one
-    unit = CORRELATED if told.listed else tempered(told.best.evidence)
-    placed = [search.passing(told.best, k, unit) for _, k in used]
+    placed = [search.passing(told.best, k, told.unit) for _, k in used]
+    middle, sigma = placed[0]
+    if not told.listed and told.unlisted is not None:
+        common = told.unlisted.common or told.unlisted
+        own = ends_sigma(search, common, tempered(common.evidence, False))
+        # the vehicles at its ends may be others: up to half a car more or less, each as likely
+        half = 0.5 * CAR[0] / common.speed
+        sigma = float(np.sqrt(sigma**2 + own**2 + half**2 / 3))
     return replace(
         told,
-        middle=placed[0],
+        middle=(middle, sigma),
         direction=_direction(channels, placed, told.best.speed) if told.listed else 0,
         spectral=_spectral(told.best, used[0][1]) if told.listed else None,
     )

@@ -115,6 +115,26 @@ def grown(search: Search, fits: Sequence[ResponseFit], followed: int = _GROWN) -
     return list(fits)
 
 
+def ends_sigma(search: Search, fit: ResponseFit, unit: float) -> float:
+    """How well the times (s) of first and last wheelset of a train of equal cars are known.
+
+    A vehicle more or less at an end, of its own size, changes what all others do but little: rms
+    over all that are tried, as far as the evidence tells.
+
+    Args:
+        unit: difference of evidence that stands for a factor e.
+    """
+    assert fit.cars is not None
+    trials = [changed(search, fit, cars) for cars in (*fit.cars.numbers(), *fit.cars.powered())]
+    evidence = np.array([trial.evidence for trial in trials])
+    weight = np.exp((evidence - evidence.max()) / unit)
+    half = np.array([0.5 * trial.train.span / trial.speed for trial in trials])
+    middle = np.array([trial.models[-1].centre for trial in trials])
+    ends = np.stack([middle - half, middle + half])
+    mean = ends @ weight / weight.sum()
+    return float(np.sqrt(np.mean((ends - mean[:, None]) ** 2 @ weight / weight.sum())))
+
+
 def changed(search: Search, fit: ResponseFit, cars: EqualCars) -> ResponseFit:
     """The fit with other equal cars, of which the first, the last or the middle stays."""
     assert fit.cars is not None
