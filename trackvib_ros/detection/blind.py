@@ -35,6 +35,7 @@ _LIKELY = 0.5  # a number of wheelsets in one channel that is likelier right tha
 _AMONG = (2.0, 60.0)  # Hz, in which those of a type are compared with others
 _ELSEWHERE = 0.6  # m, half the least distance of two wheelsets
 _BOGIE = 2  # wheelsets
+_PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
 _SHOWN = 0.9  # of the two metres about a wheelset, to be measured
 _SHAPE = 0.012  # m, of wheelsets against each other, by the shape of their pulse: computed at 40 dB
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
@@ -334,7 +335,7 @@ def describe_alone(shown: Shown) -> Blind | None:
         motion=found.motion,
         speed=(speed, sigma),
         times=found.times,
-        time_sigma=found.time_sigma,
+        time_sigma=np.hypot(found.time_sigma, 0.0 if deflected else _PULSE_SIGMA_S),
         regular=found.certainty if whole else min(found.certainty, 0.5),
         direction=0,
         correlation=0.0,

@@ -211,9 +211,15 @@ def corner(
         step_s = np.linalg.solve(normal, slope.T @ rest)
         most = _MOST_STEP / guess
         at = at + np.clip(step_s - np.median(step_s), -most, most)
-        variance = float(rest @ rest) / max(2 * independent - 2 * times.size - 3, 1.0)
-        variance *= 2 * independent / y.size
-        sigma = np.sqrt(np.maximum(variance * np.diag(np.linalg.inv(normal)), 0.0))
+        # what is left is noise of the waves that tell places; the lines are denser than independent
+        weight = np.sum(slope**2, axis=1)
+        variance = float(weight @ rest**2) / float(weight.sum()) * y.size
+        variance /= max(2 * independent - 2 * times.size - 3, 1.0)
+        # loads are found with the places: those of neighbours are confused with a shift
+        both = np.concatenate([slope / np.sqrt(np.diag(normal)), real(columns)], axis=1)
+        joint = both.T @ both + 1e-3 * np.eye(both.shape[1])
+        spread_s = np.diag(np.linalg.inv(joint))[: times.size] / np.diag(normal)
+        sigma = np.sqrt(np.maximum(variance * spread_s, 0.0))
         turned = turn(at)
         top = search(turned, [(top[0], top[1], top[2])])
     steps = np.diag(_STEPS)

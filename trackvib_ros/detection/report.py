@@ -22,7 +22,6 @@ from .unlisted import CAR
 Array = NDArray[np.float64]
 
 _UNITS = {1: "single", 2: "double"}
-_PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
 _MARGIN_S = 0.15  # of a record about the strong energy of a train that is wholly on it
 _MARGIN = 0.5  # m, the same about its wheelsets if these are known
 _ONSET_SIGMA = 0.02  # s, length of the short-term averages
@@ -442,9 +441,7 @@ def _unknown(
         quality = (*quality, "axle_count_not_confident")
     speed, sigma = blind.speed
     times = blind.times
-    # pulses of two channels are timed by their waveforms
-    bins = _PULSE_SIGMA_S if len(blind.sensors) == 1 else 0.0
-    time_sigma = np.hypot(blind.time_sigma, bins)
+    time_sigma = blind.time_sigma
     axles = [
         TrainEvent(
             kind="axle",

@@ -52,6 +52,10 @@ multiple units 2.2 to 3.0 m; bogies of freight wagons 1.75 to 1.85 m."""
 PLACE_SIGMA = 0.03
 """Standard deviation of the place of a wheelset's bowl (m), roughness apart from noise."""
 
+_BOWL_SIGMA = 0.012
+"""The same where place and load were found together (m): what wheelsets with other neighbours
+differ by (:mod:`evidence`)."""
+
 HUMP, HUMP_FINE = 0.5, 0.2
 """Of the log-energy at a wheelset (m), and its smoothing."""
 
@@ -491,9 +495,13 @@ def _result(
     mean, sigma, _ = speed
     covariance = np.diag([place**2, sigma**2, PRIOR_ACCELERATION**2])
     motion = Motion(middle, mean * (middle - float(times[0])), mean, 0.0, covariance)
+    if fine is not None and np.all(fine.time_sigma > 0):
+        spread = np.hypot(fine.time_sigma, _BOWL_SIGMA / mean)
+    else:
+        spread = np.full(times.size, float(np.hypot(place, PLACE_SIGMA)) / mean)
     return Single(
         times=times,
-        time_sigma=np.full(times.size, float(np.hypot(place, PLACE_SIGMA)) / mean),
+        time_sigma=spread,
         speed=speed,
         motion=motion,
         certainty=found.certainty,
