@@ -5,6 +5,7 @@ import pytest
 
 from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
+from trackvib_ros.detection.blind import _is_train
 from trackvib_ros.detection.travel import BROAD, CELL, FINE, band_pass
 from trackvib_ros.detection.wheelsets import find
 
@@ -156,3 +157,16 @@ def test_what_reaches_both_channels_at_once_is_no_train():
     events = detect(RATE, x, RAILS)
     assert [e for e in events if e.kind == "arrival"]
     assert not [e for e in events if e.kind == "passage" and e.values["grade"] == CONFIRMED]
+
+
+def test_the_blows_of_a_flat_wheel_are_no_bogies():
+    """A wheel of 0.92 m strikes the rail every 2.89 m; its record may have gaps."""
+    turn = np.pi * 0.92
+    blows = turn * np.concatenate([np.arange(11), 18 + np.arange(1), 22 + np.arange(10)])
+    bogie = np.array([0.0, 2.5])
+    bogies = np.concatenate(
+        [bogie, *(bogie + 22.0 * k + x for k in range(4) for x in (17.0, 22.0))]
+    )
+    for places, train in ((blows, False), (bogies, True)):
+        near = np.diff(places) < 3.6
+        assert _is_train(places, np.append(near, False) | np.append(False, near)) is train

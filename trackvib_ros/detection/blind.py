@@ -312,10 +312,13 @@ def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion,
 
 def _is_train(places: Array, paired: NDArray[np.bool_]) -> bool:
     """Whether pulses that both channels show are a train: three bogies or more, as any two
-    disturbances have a delay that fits; in pairs, or many."""
-    bogies = 1 + int(np.sum(np.diff(places) > _PARTNER))
+    disturbances have a delay that fits; in pairs, or many. The ends of two cars have two bogies:
+    what goes on at such gaps is a flat wheel that strikes the rail at every turn."""
+    ends = np.flatnonzero(np.diff(places) > _PARTNER) + 1
+    groups = np.diff(np.concatenate([[0], ends, [places.size]]))
     many = paired.sum() >= _LEAST_WHEELSETS or places.size >= 2 * _LEAST_WHEELSETS
-    return bogies >= _LEAST_BOGIES and bool(many)
+    usual = float(np.median(groups)) <= 2 * _BOGIE
+    return groups.size >= _LEAST_BOGIES and usual and bool(many)
 
 
 def describe_alone(shown: Shown) -> Blind | None:
