@@ -8,7 +8,8 @@ import pytest
 from solver import load_scenario_text
 from tests.detection.synthetic import CATALOGUE, NUISANCES, RAILS, Passage, nuisance, record
 from trackvib_ros.bag import BagReader
-from trackvib_ros.detection import CONFIRMED, VIBRATION, Channel, detect
+from trackvib_ros.detection import CONFIRMED, VIBRATION, Channel, detect, detector
+from trackvib_ros.detection.closing import Closing
 
 BAGS = Path(__file__).parents[2] / "bags"
 RATE = 2000
@@ -124,6 +125,20 @@ def test_a_synthetic_record_that_begins_inside_a_train(rails):
         truth.speed,
         lambda name: truth.axle_times({"rail_a": 0.0, "rail_b": 20.0}[name])[-1] - cut / RATE,
     )
+
+
+@pytest.mark.parametrize(("inside", "speed"), [(False, 50.0), (False, 30.0), (True, 50.0)])
+def test_a_record_gone_through_once_more_begins_in_a_train_only_without_quiet(
+    monkeypatch, inside, speed
+):
+    ended = []
+    monkeypatch.setattr(Closing, "conclude", lambda _, event: ended.append(event) or [])
+    monkeypatch.setattr(detector, "_BEGUN", 0.0)  # as if a train had been near at the start
+    truth = Passage(CATALOGUE["CRH3"].axles, speed)
+    times = truth.axle_times(0.0)
+    cut = round(RATE * (0.6 * times[0] + 0.4 * times[-1])) if inside else 0
+    detect(RATE, samples(truth, RAILS)[cut:], RAILS)
+    assert [event.begun is not None for event in ended] == [inside]
 
 
 def test_too_little_of_a_train_is_no_passage():

@@ -529,8 +529,12 @@ class TrainDetector:
         )
         begun = None
         if self._inside:
+            self._inside = False
             start = self._start_ns or 0
-            begun, self._inside = (self._rails(event, start, now_ns), start), False
+            speed = event.speed[0] if event.speed else self.config.min_speed
+            # had the record begun inside the train, a wheelset would have come before
+            if (event.start_ns - start) * 1e-9 < self._clear_s(speed):
+                begun = self._rails(event, start, now_ns), start
         ends = {c: past.clear_ns[c] for c in past.next_ns} if past else {}
         records = self._records(event, origin, now_ns, ends)
         found = past.found if past else None
