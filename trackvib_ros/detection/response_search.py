@@ -176,9 +176,8 @@ class Search:
                 )
                 v, score = float(speeds[i]), float(total[i])
                 found.append(ResponseFit(train, reverse, v, float(a), score, placed))
-        found.sort(key=lambda fit: -fit.evidence)
         apart: list[ResponseFit] = []
-        for fit in found:
+        for fit in ranked(found):
             near = 2 * _NEIGHBOUR * COARSE / train.span
             if all(abs(fit.speed / other.speed - 1) > near for other in apart):
                 apart.append(fit)
@@ -398,8 +397,7 @@ class Search:
                     best = replace(trial, speed=v_best, acceleration=a_best, evidence=value)
             if best is not None:
                 found.append(best)
-        found.sort(key=lambda fit: -fit.evidence)
-        return found[:_PEAKS]
+        return ranked(found)[:_PEAKS]
 
     def passing(self, fit: ResponseFit, k: int, unit: float) -> tuple[float, float]:
         """When the middle of the train passes the channel of observation ``k`` (s), sigma.
