@@ -1,12 +1,14 @@
 """Places of wheelsets from their deflection, against pulses whose place is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from trackvib_ros.detection import Catalogue
 from trackvib_ros.detection.kinematics import Motion
-from trackvib_ros.detection.place import Wave, agreement, likelihood, locate, spectrum
+from trackvib_ros.detection.place import Wave, agreement, classes, likelihood, locate, spectrum
 
 AXLES = Catalogue.default()["CRH3"].axles
 RATE = 1000.0
@@ -123,28 +125,50 @@ def test_the_motion_is_corrected_with_the_stated_covariance():
     half = 0.5 * AXLES[-1]
     for seed in range(30):
         rng = np.random.default_rng(2000 + seed)
-        speed, noise = rng.uniform(15.0, 90.0), rng.uniform(0.05, 0.5)
+        speed, noise = rng.uniform(15.0, 90.0), 10.0 ** rng.uniform(-1.0, 0.7)
         given, motion = wave(speed, rng.uniform(-0.3, 0.3), noise, seed, coupling=1.0)
-        true = rng.uniform(-0.1, 0.1, 2)
+        # both ends within 0.03 m, the middle within 0.015 m: most of what the noisiest tell
+        known = np.array([0.3, 0.03, 0.03]) / np.array([1.0, half / speed, (half / speed) ** 2])
+        true = 0.03 * rng.standard_normal(2)
+        middle = motion.moved(float(motion.time_at(half)))
+        motion = replace(middle, covariance=np.diag(known**2))
         along = AXLES / half - 1
         expected = AXLES - true[0] * along - 0.5 * true[1] * along**2
         found = agreement([given], motion, [expected])
         ratios.append(np.linalg.solve(np.linalg.cholesky(found.covariance), found.change - true))
+        assert np.max(np.diag(found.covariance)) < 0.031**2
     # 60 numbers: the rms of unit normals lies within 1 +- 3 / sqrt(120)
     assert 0.73 < np.sqrt(np.mean(np.square(ratios))) < 1.27
 
 
+def by_class(speed, seed, axles, noise):
+    """The same rough rail under every wheelset, whose neighbours shift it, waves by waves, by 5 mm."""
+    rng = np.random.default_rng(seed)
+    size = 2**14
+    k = 2 * np.pi * np.fft.rfftfreq(size, speed / RATE)
+    about = np.fft.rfft(rng.standard_normal(size) * np.exp(-np.arange(size) * speed / RATE))
+    waves = 3 * about / np.std(about[(k > 1) & (k < 30)]) * (k > 1) * (k < 30)
+    alike, comb = classes(axles), np.zeros(k.size, dtype=complex)
+    for first in range(0, 30, 5):
+        part = (k >= first) & (k < first + 5)
+        at = 4 * speed + axles + 0.005 * rng.standard_normal(alike.max() + 1)[alike]
+        comb[part] = np.exp(-1j * np.outer(k[part], at)).sum(axis=1)
+    value = np.fft.irfft(waves * comb, size)
+    value = value / np.std(value) + noise * rng.standard_normal(size)
+    motion = Motion(4.0, 0.0, speed, 0.0, np.diag([1.0, 0.01, 1e-4]))
+    return Wave(np.arange(size) / RATE, value, np.ones(size, dtype=bool)), motion
+
+
 def test_trains_that_differ_by_centimetres_are_told_apart_as_surely_as_is_said():
-    """CRH2 shrunk to the length of a CRH3 has bogies 3 cm nearer each other."""
+    """Their bogies lie 6 mm nearer each other, as much as their neighbours shift them by."""
     twin = Catalogue.default()["CRH2"].axles
-    kinds = (AXLES, twin * AXLES[-1] / twin[-1])
+    kinds = (AXLES, AXLES + 0.2 * (twin * AXLES[-1] / twin[-1] - AXLES))
     right, probability = [], []
-    for seed in range(60):
-        rng = np.random.default_rng(3000 + seed)
+    for seed in range(40):
         true = seed % 2
-        # at the least noise they are told apart at five sigma, at the most hardly at all
-        noise = 10.0 ** rng.uniform(-2.0, 0.5)
-        given, motion = wave(60.0, 0.1, noise, seed, axles=kinds[true])
+        # at the least noise the classes hide more, at the most hardly anything is told
+        noise = 10.0 ** np.random.default_rng(3000 + seed).uniform(-2.0, 1.0)
+        given, motion = by_class(60.0, seed, kinds[true], noise)
         odds = np.diff([agreement([given], motion, [places]).log for places in kinds])[0]
         probability.append(1 / (1 + np.exp(-odds * (1 if true else -1))))
         right.append(probability[-1] > 0.5)
@@ -152,7 +176,7 @@ def test_trains_that_differ_by_centimetres_are_told_apart_as_surely_as_is_said()
     # the number of right answers scatters by the root of the sum of p (1 - p)
     spread = np.sqrt(np.sum(said * (1 - said)))
     assert abs(np.sum(right) - np.sum(said)) < 3 * spread
-    assert np.sum(right) > 45 and np.mean(said) > 0.75
+    assert np.sum(right) > 30 and np.mean(said) > 0.75
 
 
 @pytest.mark.parametrize("places", [-AXLES, 0 * AXLES, np.nan * AXLES])

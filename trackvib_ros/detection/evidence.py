@@ -23,7 +23,7 @@ from scipy.special import ndtr
 
 from .axles import AxleFit
 from .kinematics import PRIOR_ACCELERATION, Motion
-from .place import Wave, agreement
+from .place import ALIKE, FAR, Wave, agreement, classes
 
 Array = NDArray[np.float64]
 Kind: TypeAlias = Literal["type", "scaled", "varied", "moved", "clock"]
@@ -44,8 +44,6 @@ LISTED: tuple[Kind, ...] = ("type", "moved", "clock")
 # and 40 dB rms 0.012 m, one in twenty beyond 0.03 m; more where noise hides a pulse
 _CLASS_SIGMA = 0.03
 _LEAN_SIGMA = 0.012  # m, the same of both wheelsets of a bogie: the rms of them all
-_ALIKE = 0.1  # m, gaps that differ by less are the same
-_FAR = 12.0  # m, neighbours that do not matter
 _LEAST_NOISE = 0.005  # m, a wheelset is timed in cells of 0.1 m: finer agreement is chance
 _SCALE = 0.04  # catalogue types of one shape differ this much in size (CRH1 : CR400AF 6 %)
 _SCALE_VARIED = 0.08
@@ -110,36 +108,25 @@ class Explanation:
     phase: float = 0.0
 
 
-def _classes(places: Array) -> NDArray[np.int64]:
-    """Number of every wheelset's class: same distances to both neighbours, far ones alike."""
-    gaps = np.minimum(np.diff(places, prepend=places[0] - 99.0, append=places[-1] + 99.0), _FAR)
-    order = np.argsort(gaps)
-    # rounding would part gaps at its limits, equal but for their last digit
-    alike = np.empty(gaps.size, dtype=np.int64)
-    alike[order] = np.cumsum(np.diff(gaps[order], prepend=gaps[order[0]]) > _ALIKE)
-    pairs = np.stack([alike[:-1], alike[1:]], axis=1)
-    return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), dtype=np.int64)
-
-
 def _lean(places: Array) -> Array:
     """Which side of every wheelset's bogie the nearer other bogie is on: 1 before, -1 behind, 0."""
     gaps = np.diff(places)
     bogie = np.concatenate([[0], np.cumsum(gaps > _NEAR)])
     between = np.concatenate([[np.inf], gaps[gaps > _NEAR], [np.inf]])
     before, behind = between[:-1], between[1:]
-    nearer = np.minimum(before, behind) < _FAR
-    lean = np.where(nearer & (np.abs(before - behind) > _ALIKE), np.sign(behind - before), 0.0)
+    nearer = np.minimum(before, behind) < FAR
+    lean = np.where(nearer & (np.abs(before - behind) > ALIKE), np.sign(behind - before), 0.0)
     return np.asarray(lean[bogie])
 
 
 def _noise(candidate: Candidate) -> float:
     """Scatter of wheelsets of one class about their median (m), outliers limited."""
-    classes = _classes(candidate.places)
+    alike = classes(candidate.places)
     residual = candidate.fit.residual
     rest, members = [], 0
     for c in range(residual.shape[0]):
-        for k in np.unique(classes):
-            use = candidate.fit.observed[c] & (classes == k)
+        for k in np.unique(alike):
+            use = candidate.fit.observed[c] & (alike == k)
             if use.sum() >= 3:
                 rest.append(residual[c, use] - np.median(residual[c, use]))
                 members += int(use.sum())
@@ -243,7 +230,7 @@ def _in_phase(candidate: Candidate, motion: Motion, places: Array, speed: float)
         scale * motion.distance,
         scale * motion.speed,
         scale * motion.acceleration,
-        motion.covariance,
+        scale**2 * motion.covariance,
     )
     places = scale * places
     ahead = [
@@ -275,15 +262,15 @@ def explain(candidates: Sequence[Candidate]) -> list[Explanation]:
         channels, axles = c.fit.observed.shape
         common = _comparable(c, likely, noise)
         use = c.fit.observed if common is None else c.fit.observed & common
-        classes = _classes(c.places)
+        alike = classes(c.places)
         base: list[Array] = []
         variances, directions = np.linalg.eigh(c.fit.place + c.site)
         for variance, along_channels in zip(variances, directions.T, strict=True):
             if variance > 1e-12:
                 base.append(np.outer(np.sqrt(variance) * along_channels, np.ones(axles)))
-        for k in range(int(classes.max()) + 1):
+        for k in range(int(alike.max()) + 1):
             # what all wheelsets have in common is in the place of the channel
-            share = (classes == k) - np.mean(classes == k)
+            share = (alike == k) - np.mean(alike == k)
             for row in np.eye(channels):
                 base.append(_CLASS_SIGMA * np.outer(row, share))
         lean = _lean(c.places)

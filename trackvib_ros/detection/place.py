@@ -55,7 +55,8 @@ _PULSE = np.arange(-2.0, 2.01, 1.0)  # m about a wheelset; as dense as the width
 _ROUNDS = 2
 _COMPLETIONS = 4  # of holes; each leaves of the error what is missing, a fifth
 _IN_DOUBT = 1.0  # rad, standard deviation of a phase that is within half a turn at three
-_CHANGE = 0.3  # m, within which the motion is known already
+_CHANGE = 0.3  # m, within which the motion is known already, whatever its covariance
+_CLASS_SIGMA = 0.005  # m, in every group; on computed passages at 40 dB 0.001 to 0.008
 _LEAST = 1e-6  # of the energy that a perfect fit leaves
 
 DEFLECTION_SIGMA = 0.003
@@ -64,6 +65,12 @@ rms difference of two channels, over 2**0.5, on 60 computed passages at 40 dB, 4
 
 LAG_SIGMA = 0.005
 """What damped pads make the deflections of all channels lag by (m, rms on the same passages)."""
+
+ALIKE = 0.1
+"""Gaps between wheelsets that differ by less (m) are the same."""
+
+FAR = 12.0
+"""Distance (m) at which a neighbour does not matter."""
 
 CLIPPED_SIGMA = 0.2
 """The same of a clipped channel (m): of 66 that were computed and cut at a fifth of their peak half
@@ -225,8 +232,8 @@ class Agreement:
     """How well one pulse, whatever its shape, repeated by every wheelset explains the waveforms.
 
     Attributes:
-        log: likelihood (ln) against noise with all pulses weighed, negative if noise explains the
-            waveforms as well; 0 if no channel shows anything of the train.
+        log: likelihood (ln) against noise with all pulses and changes weighed, negative if noise
+            explains the waveforms as well; 0 if no channel shows anything of the train.
         change: what the wheelsets lie beyond their expected places (m): the part that grows by one
             from the middle of the train to its end, and half the part that grows with its square.
         covariance: of the change (m²).
@@ -259,6 +266,12 @@ class _Group:
     def __post_init__(self) -> None:
         k = self.course.k[self.part]
         self._first, self._step = float(k[0]), float(k[1] - k[0])
+        alike = classes(self.at)
+        member = np.arange(int(alike.max()) + 1)[:, None] == alike
+        along = 2 * (self.at - self.at[0]) / (self.at[-1] - self.at[0]) - 1
+        # what all wheelsets have in common is in the pulse
+        own = _CLASS_SIGMA * (member - member.mean(axis=1, keepdims=True))
+        self._bend = np.stack([np.ones_like(along), along, 0.5 * along**2, *own])
         bands = max(1, round(k.size * self._step / _BAND))
         self._band = np.arange(k.size) * bands // k.size
         self._share = _independent(self.course) / self.course.k.size
@@ -270,28 +283,33 @@ class _Group:
 
         The pulse that fits best sets the weights and the likelihood.
         """
-        along = 2 * (self.at - self.at[0]) / (self.at[-1] - self.at[0]) - 1
-        bend = np.stack([np.ones_like(along), along, 0.5 * along**2])
-        ahead = self.at - self.at[0] + change @ bend[1:]
+        ahead = self.at - self.at[0] + change @ self._bend[1:3]
         k, phases = _phases(self._first, self._step, self.seen.size, ahead)
-        comb, *slopes = bend @ phases
+        comb, *slopes = self._bend @ phases
         pulse = np.exp(-1j * np.outer(_PULSE, k))
         taps = pulse * comb
-        left, pulled = self._reduced(taps, self.seen[None])
+        free = np.concatenate([taps, 1j * taps])
+        _, shape, _ = self._reduced(free, free[:0], self.seen[None])
+        alone = np.concatenate([pulse, 1j * pulse])
+        slopes = (shape[0] @ alone) * -1j * k * np.array(slopes)
+        rows = np.concatenate([self.seen[None], slopes[:2]])
+        left, _, _ = self._reduced(free, slopes[2:], rows)
         level, self._weight = self._noise(left[0])
+        left, shape, doubt = self._reduced(free, slopes[2:], rows)
+        own = shape[:, len(free) :]
         # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
         cost = _PULSE.size * float(np.log(2 * self._share * k.size))
-        self.log = level - self._alone - cost
+        self.log = level - self._alone - cost - 0.5 * (float(own[0] @ own[0]) + doubt)
         begun = bool(np.any(self.pulses))
-        self.pulses = (pulled[0] @ taps) / (1.0 if begun else self.course.measured)
-        slope = (pulled[0] @ pulse) * -1j * k * np.array(slopes)
-        slope, _ = self._reduced(taps, slope)
+        pulses = shape[0] @ np.concatenate([free, slopes[2:]])
+        self.pulses = pulses / (1.0 if begun else self.course.measured)
         # the second derivative of the likelihood: the weight less by how it falls with the rest
         bent = self._weight * (
             1 - self._weight * np.abs(left[0]) ** 2 / (2 * self._share * (_LINES + 1))
         )
-        normal = np.real((slope * bent).conj() @ slope.T)
-        return normal, np.real((slope * self._weight).conj() @ left[0])
+        normal = np.real((left[1:] * bent).conj() @ left[1:].T) + own[1:] @ own[1:].T
+        right = np.real((left[1:] * self._weight).conj() @ left[0]) + own[1:] @ own[0]
+        return normal, right
 
     def _noise(self, rest: Any) -> tuple[float, Array]:
         """Log likelihood of what would be noise, and the weight of every wavenumber.
@@ -312,13 +330,29 @@ class _Group:
         weight = 2 * self._share * (_LINES + 1) / (_LINES * own + power)
         return self._share * float(log.sum()), weight
 
-    def _reduced(self, taps: Any, rows: Any) -> tuple[Any, Any]:
-        """Rows less what of them pulses explain, and these pulses."""
-        weighted = taps.conj() * self._weight
-        normal = weighted @ taps.T
-        normal += 1e-9 * np.trace(normal).real * np.eye(len(taps))
-        shape = np.linalg.solve(normal, weighted @ rows.T).T
-        return rows - shape @ taps, shape
+    def _reduced(self, free: Any, own: Any, rows: Any) -> tuple[Any, Any, float]:
+        """Rows less what pulses and effects of variance one explain, what of these, and twice what
+        the effects take of the likelihood (ln) by being in doubt."""
+        design = np.concatenate([free, own])
+        weighted = design.conj() * self._weight
+        normal = np.real(weighted @ design.T)
+        pulses = normal[: len(free), : len(free)]
+        pulses += 1e-9 * np.trace(pulses) * np.eye(len(free))
+        normal[len(free) :, len(free) :] += np.eye(len(own))
+        shape = np.linalg.solve(normal, np.real(weighted @ rows.T)).T
+        doubt = float(np.linalg.slogdet(normal)[1] - np.linalg.slogdet(pulses)[1])
+        return rows - shape @ design, shape, doubt
+
+
+def classes(places: Array) -> NDArray[np.int64]:
+    """Number of every wheelset's class: same distances to both neighbours, far ones alike."""
+    gaps = np.minimum(np.diff(places, prepend=places[0] - 99.0, append=places[-1] + 99.0), FAR)
+    order = np.argsort(gaps)
+    # rounding would part gaps at its limits, equal but for their last digit
+    alike = np.empty(gaps.size, dtype=np.int64)
+    alike[order] = np.cumsum(np.diff(gaps[order], prepend=gaps[order[0]]) > ALIKE)
+    pairs = np.stack([alike[:-1], alike[1:]], axis=1)
+    return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
 def _phases(first: float, step: float, count: int, at: Array) -> tuple[Array, Any]:
@@ -340,9 +374,11 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
     crossings stay where they are. In every group of bands of wavenumbers a pulse within 2 m of its
     wheelset is fitted by least squares, weighted by the noise it leaves, whose level is unknown in
     every band, for a bridge answers to some. A group shows a pulse or only noise, with even odds.
-    The change of the motion follows from the long waves to shorter ones (Newton), as far as their
-    phase is not in doubt. Coupling, foundation, layer and a place of the channel that is off are
-    in the pulse; wheelsets that pass in a hole of the record have less of one.
+    The pulses of wheelsets with other neighbours lie elsewhere, in every group by an unknown few
+    millimetres. The change of the motion, known as far as its covariance says, follows from the
+    long waves to shorter ones (Newton), as far as their phase is not in doubt; what is unknown is
+    integrated over (Laplace). Coupling, foundation, layer and a place of the channel that is off
+    are in the pulse; wheelsets that pass in a hole of the record have less of one.
 
     Args:
         waves: per channel.
@@ -356,7 +392,10 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
             courses.append((course, at))
     model = [np.zeros(course.k.size, dtype=np.complex128) for course, _ in courses]
     seen = [course.seen() for course, _ in courses]
-    change, normal, right = np.zeros(2), np.diag([_CHANGE**-2] * 2), np.zeros(2)
+    if not courses:
+        return Agreement(0.0, np.zeros(2), np.diag([_CHANGE**2] * 2))
+    prior = _known(motion, places[0])
+    change, normal, right = np.zeros(2), prior, np.zeros(2)
     asked: list[_Group] = []
     for low, high in _GROUPS:
         ends = np.array([[1.0, 0.5], [-1.0, 0.5]])
@@ -387,7 +426,19 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
     for group in asked:
         group.explained(change)
     log = sum(float(np.logaddexp(0.0, group.log)) - float(np.log(2)) for group in asked)
-    return Agreement(log, change, np.linalg.inv(normal))
+    log -= 0.5 * float(change @ prior @ change)
+    log -= 0.5 * float(np.linalg.slogdet(normal)[1] - np.linalg.slogdet(prior)[1])
+    return Agreement(log, change, np.asarray(np.linalg.inv(normal), dtype=np.float64))
+
+
+def _known(motion: Motion, places: Array) -> Array:
+    """Inverse covariance (1/m²) of the change of a motion, before the waveforms are asked."""
+    middle, half = 0.5 * (places[0] + places[-1]), 0.5 * (places[-1] - places[0])
+    at = motion.moved(float(motion.time_at(middle)))
+    duration = half / at.speed
+    growth = np.array([[0.0, duration, 0.0], [0.0, 0.0, duration**2]])
+    known = growth @ at.covariance @ growth.T + DEFLECTION_SIGMA**2 * np.eye(2)
+    return np.asarray(np.linalg.inv(known) + np.eye(2) / _CHANGE**2, dtype=np.float64)
 
 
 def _mid_speed(motion: Motion, places: Array) -> float:
