@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,27 +32,37 @@ def spread(values: Sequence[float | None], scale: float = 1.0) -> dict[str, floa
     }
 
 
-def ratios(pairs: Sequence[tuple[float | None, float | None]]) -> Array:
-    """Error over stated sigma, where both are known."""
-    return np.array([e / s for e, s in pairs if e is not None and s], dtype=np.float64)
+def _ratio(error: float | None, sigma: float | None) -> list[float]:
+    return [error / sigma] if error is not None and sigma else []
+
+
+STATED: dict[str, Callable[[PassageScore], list[float]]] = {
+    "speed": lambda p: _ratio(p.speed_error, p.speed_sigma),
+    "acceleration": lambda p: _ratio(p.acceleration_error, p.acceleration_sigma),
+    "arrival": lambda p: _ratio(p.arrival_s, p.arrival_sigma_s),
+    "departure": lambda p: _ratio(p.departure_s, p.departure_sigma_s),
+    "provisional speed": lambda p: [r for update in p.updates for r in _ratio(*update)],
+}
+"""Error over stated sigma of every value of a passage that has both, by quantity."""
+
+
+def standardised(found: Sequence[PassageScore]) -> dict[str, Array]:
+    """Error over stated sigma of all passages, by quantity, of any length."""
+    return {
+        name: np.array([r for p in found for r in of(p)], dtype=np.float64)
+        for name, of in STATED.items()
+    }
 
 
 def calibration(found: Sequence[PassageScore]) -> dict[str, dict[str, float]]:
     """Per quantity: rms of error over sigma, part within the stated 95 % interval, number."""
-    quantities = {
-        "speed": ratios([(p.speed_error, p.speed_sigma) for p in found]),
-        "acceleration": ratios([(p.acceleration_error, p.acceleration_sigma) for p in found]),
-        "arrival": ratios([(p.arrival_s, p.arrival_sigma_s) for p in found]),
-        "departure": ratios([(p.departure_s, p.departure_sigma_s) for p in found]),
-        "provisional speed": ratios([update for p in found for update in p.updates]),
-    }
     table = {
         name: {
             "rms": float(np.sqrt(np.mean(r**2))),
             "within_95": float(np.mean(np.abs(r) < 1.96)),
             "number": float(r.size),
         }
-        for name, r in quantities.items()
+        for name, r in standardised(found).items()
         if r.size
     }
     scored = sum(p.axle_scored for p in found)
@@ -326,20 +336,11 @@ def figure(result: Evaluation, path: Path) -> None:
     picture.savefig(path, dpi=120, format="png")
 
 
-def _residuals(found: Sequence[PassageScore]) -> dict[str, Array]:
-    return {
-        "speed": ratios([(p.speed_error, p.speed_sigma) for p in found]),
-        "arrival": ratios([(p.arrival_s, p.arrival_sigma_s) for p in found]),
-        "departure": ratios([(p.departure_s, p.departure_sigma_s) for p in found]),
-        "acceleration": ratios([(p.acceleration_error, p.acceleration_sigma) for p in found]),
-    }
-
-
 def _quantiles(axis: Any, found: Sequence[PassageScore]) -> None:
     """Error over stated sigma against the quantiles of the normal distribution."""
     from scipy.stats import norm
 
-    for name, r in _residuals(found).items():
+    for name, r in standardised(found).items():
         if r.size > 3:
             expected = norm.ppf((np.arange(r.size) + 0.5) / r.size)
             axis.plot(expected, np.clip(np.sort(r), -6, 6), ".", ms=4, label=name)
@@ -354,7 +355,7 @@ def _coverage(axis: Any, found: Sequence[PassageScore]) -> None:
     from scipy.stats import norm
 
     level = np.linspace(0.02, 0.98, 49)
-    for name, r in _residuals(found).items():
+    for name, r in standardised(found).items():
         if r.size > 3:
             inside = [float(np.mean(np.abs(r) < norm.ppf(0.5 + p / 2))) for p in level]
             axis.plot(level, inside, label=name)
