@@ -60,7 +60,7 @@ def test_an_unlisted_train_on_one_rail(speed, base, length):
     axles = (car + length * np.arange(5)[:, None]).ravel()
     only = Catalogue((Catalogue.default()["articulated"],), "one type of another shape")
     truth = Passage(axles, speed)
-    rate, x = record([truth], RAILS[:1], 25, kind="pulse", rates={"rail": 2000})["rail_a"]
+    rate, x = record([truth], RAILS[:1], 10, kind="pulse", rates={"rail": 2000})["rail_a"]
     (passage,) = (e for e in detect(rate, x, RAILS[0], only) if e.kind == "passage")
     values = passage.values
     assert values["grade"] == CONFIRMED and values["type"] == "unknown"
