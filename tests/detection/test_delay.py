@@ -1,9 +1,11 @@
 """The delay between two rail channels by what both have seen of a train."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from tests.detection.synthetic import CATALOGUE, RAILS, Passage, record
+from tests.detection.synthetic import CATALOGUE, RAILS, Passage, flat_blows, record
 from trackvib_ros.detection.delay import find_delay, log_ratio
 from trackvib_ros.detection.features import GroupStream
 from trackvib_ros.detection.record import Record
@@ -28,14 +30,18 @@ def records(samples, floor):
     return out
 
 
-def train(seed, kind, snr, seen, name=None, apart=APART):
-    """A train of which ``seen`` metres have passed both channels, ``apart`` as is thought."""
+def train(seed, kind, snr, seen, name=None, apart=APART, limit=np.inf):
+    """A train of which ``seen`` metres have passed both channels, ``apart`` as is thought.
+
+    Samples beyond ``limit`` of the largest are clipped.
+    """
     rng = np.random.default_rng(seed)
     name = name or ("CRH3", "articulated", "metro", "locomotive_hauled")[seed % 4]
     direction = 1 if seed % 2 else -1
     truth = Passage(CATALOGUE[name].axles, rng.uniform(60, 360) / 3.6, direction=direction)
     signals = record([truth], RAILS, snr, seed=seed, rates={"rail": RATE}, kind=kind)
     samples = np.stack([signals[c.name][1] for c in RAILS], axis=1)
+    samples = np.clip(samples, *(sign * limit * np.abs(samples).max() for sign in (-1, 1)))
     first = [truth.axle_times(c.x)[0] for c in RAILS]
     now = max(first) + seen / truth.speed
     quiet = samples[: round((min(first) - 0.5) * RATE)]
@@ -107,3 +113,32 @@ def test_what_is_no_train_has_no_delay(kind):
         if kind == "hum":
             samples += 5 * np.sin(2 * np.pi * rng.uniform(5, 200) * time)[:, None]
         assert find_delay(*records(samples, 1.0), (1.0, 3.0), LIMITS, APART) is None
+
+
+def test_a_clipped_waveform_places_no_better_than_energies():
+    # two of either, 25 cm each, on 20 m
+    least = 0.25 / 2**0.5 / 20
+    for seed in range(2):
+        for limit in (np.inf, 0.2):
+            _, delay = train(seed, "pulse", 20, 45.0, limit=limit)
+            assert delay is not None
+            assert (delay.sigma > 0.9 * least * delay.speed) is bool(np.isfinite(limit))
+
+
+@pytest.mark.parametrize("turns", [6.9, 7.5])
+def test_blows_of_flats_tell_no_delay(turns):
+    """Both channels hear a blow at once, and the next one turn later: whole turns alone agree."""
+    rails = [RAILS[0], replace(RAILS[1], x=RAILS[0].x + 2.9 * turns)]
+    for seed in range(2):
+        truth = Passage(CATALOGUE["metro"].axles, (20.0, 35.0)[seed])
+        duration = 3.5 + 60 / truth.speed
+        time = np.arange(round(duration * RATE)) / RATE
+        samples = np.random.default_rng(seed).standard_normal((time.size, 2))
+        for row, channel in enumerate(rails):
+            samples[:, row] += flat_blows(truth, channel, time, RATE, (1, 6), 30.0)
+        now = float(truth.axle_times(rails[1].x)[0] + 30 / truth.speed)
+        both = [
+            replace(r, channel=channel)
+            for r, channel in zip(records(samples[time < now], 1.0), rails, strict=True)
+        ]
+        assert find_delay(*both, (2.5, now), LIMITS, (2.9 * turns, 0.0)) is None

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from trackvib_ros.detection import Catalogue
 from trackvib_ros.detection.axles import AxleFit
+from trackvib_ros.detection.evidence import Explanation
 from trackvib_ros.detection.kinematics import regress
 from trackvib_ros.detection.passage import IN_PLACE, Hypothesis, Passage
+from trackvib_ros.detection.passage_search import _apart
 from trackvib_ros.detection.pattern import Trace
 
 METRO = Catalogue.default().types[[t.name for t in Catalogue.default().types].index("metro")]
@@ -77,3 +81,14 @@ def test_one_channel_names_no_type_that_is_a_car_longer_than_what_is_strong():
     assert whole > 300 - 4
     # two standard deviations between eight and the rest: the test's power is nine tenths
     assert front < 0.2 * 300 and rear < 0.2 * 300
+
+
+def test_a_listed_train_is_not_two_of_which_one_is_none():
+    whole = _passage(np.random.default_rng(4).normal(0.0, 0.05, (2, METRO.axles.size)))
+    relative = Explanation(0, "scaled", 0.9, whole.hypotheses[0].fit.motion)
+    unlisted = replace(whole, explanations=(relative,))
+    late = replace(whole, clock_offset=(("b", 0.2, 0.01),))
+    assert whole.known and late.known and unlisted.confirmed and not unlisted.known
+    assert [_apart(part, whole) for part in (whole, unlisted, late)] == [True, False, False]
+    # what no type explains as a whole may be any two trains
+    assert all(_apart(part, unlisted) for part in (whole, unlisted, late))

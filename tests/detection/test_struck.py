@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from tests.detection.synthetic import CATALOGUE, RAILS, Passage, blocks, flat_blows, record
+from tests.detection.test_delay import LIMITS, records
 from trackvib_ros.detection import CONFIRMED, TrainDetector
+from trackvib_ros.detection import struck as hidden
 
 FLAT = (2, 9, 15, 20)
 AMPLITUDE = 50.0  # over the rms of the wheelsets; the noise has 2.5
@@ -43,6 +45,17 @@ def test_the_sum_over_all_wheelsets_shows_the_train(name, kmh, seed):
     first, last = truth.axle_times(values["reference_x"].value)[[0, -1]]
     assert abs(passage.stamp_ns * 1e-9 - first) < 3 * values["arrival_sigma"]
     assert abs(values["departure_ns"] * 1e-9 - last) < 3 * values["departure_sigma"]
+
+
+def test_a_train_is_on_record_if_one_channel_has_all_of_it():
+    truth = Passage(CATALOGUE["metro"].axles, 110 / 3.6, start=3.5, direction=-1)
+    signals = struck(truth, 1)
+    samples = np.stack([signals[c.name][1] for c in RAILS], axis=1)
+    ends = sorted(float(truth.axle_times(c.x)[-1]) for c in RAILS)
+    for end, seen in ((0.5 * sum(ends), True), (ends[0] - 0.5, False)):
+        both = records(samples[: round(end * 2000)], float(samples[:4000].var()))
+        found = hidden.find(both, (3.0, end), CATALOGUE.types, LIMITS)
+        assert (found is not None) is seen
 
 
 def test_blows_that_repeat_are_no_train():

@@ -18,7 +18,7 @@ became strong first. The prior of the speed is uniform in its logarithm. Constan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ from scipy.interpolate import CubicSpline
 from .pattern import Trace
 from .place import DEFLECTION_SIGMA
 from .record import Record
-from .strength import strong_interval
+from .strength import strong_interval, struck
 from .travel import (
     BROAD,
     CELL,
@@ -128,22 +128,24 @@ class _Trial:
 
     Args:
         waves: of both channels.
-        traces: of both channels, one per band.
+        traces: one per band, of both channels.
         within: from and to (s).
         baseline: distance of the channels (m).
         span: of speeds whose delays the filters serve (m/s).
+        clipped: whether the waveforms are bent, and place a wheel no better than energies do.
     """
 
     def __init__(
         self,
         waves: Sequence[Series],
-        traces: Sequence[Sequence[Trace]],
+        traces: Collection[Sequence[Trace]],
         within: tuple[float, float],
         baseline: float,
         span: tuple[float, float],
+        clipped: bool,
     ) -> None:
         self.centre = float(np.sqrt(span[0] * span[1]))
-        self.baseline, self.span = baseline, span
+        self.baseline, self.span, self.clipped = baseline, span, clipped
         count = int((within[1] - within[0]) * self.centre / CELL)
         self.enough = count * CELL > baseline * self.centre / span[1] + _LEAST_OVERLAP
         if not self.enough:
@@ -151,7 +153,7 @@ class _Trial:
         steps = np.arange(count + 1, dtype=np.float64) - count
         edges = within[1] + steps * (CELL / self.centre)
         wave = np.stack([w.cells(edges) for w in waves])[:, None]
-        energy = np.stack([[t.levels(edges) for t in own] for own in traces])
+        energy = np.stack([[t.levels(edges) for t in own] for own in zip(*traces, strict=True)])
         both = np.concatenate(
             [band_pass(wave, _FINE, BROAD), band_pass(energy, _ENERGY_FINE, _ENERGY_BROAD)], axis=1
         )
@@ -241,11 +243,11 @@ class _Trial:
         rows = log_ratio(r, share[:, None] * overlap)
         out = []
         for part, near in zip(np.split(rows, cuts, axis=1), delays, strict=True):
-            out.append(part[0] + _over_bands(part[1:], near.blur))
+            out.append(self._total(part, near.blur))
         return out, share
 
     def band(self, delay: float) -> int:
-        """The band whose energies agree best at a delay (s)."""
+        """The number of the band whose energies agree best at a delay (s)."""
         r, _ = self.compare(np.array([round(delay * self.centre / _STEP)]))
         return int(np.argmax(r[1:, 0]))
 
@@ -269,9 +271,15 @@ class _Trial:
         common = _log_mean(log_ratio(r, share[:, None] * overlap)) - _log_mean(log)
         log = np.logaddexp(0.0, log + common[:, None])
         way = np.maximum(np.abs(lags), 1.0)
-        total = log[0] + _over_bands(log[1:], _PARTS * near.blur) - np.log(way)
+        total = self._total(log, _PARTS * near.blur) - np.log(way)
         weight = np.exp(total - total.max())
         return self.baseline * self.centre / _STEP / way, weight / weight.sum()
+
+    def _total(self, log: Array, blur: int) -> Array:
+        """ln of the likelihood of the waveform and of the energies, a wheel being seen near where
+        it stands, shape (signals, lags)."""
+        wave = _over_bands(log[:1], blur) if self.clipped else log[0]
+        return np.asarray(wave + _over_bands(log[1:], blur))
 
     def _pairs(self, lag: int) -> float:
         """Independent pairs a cell that make a peak of the waveform as wide as it is uncertain.
@@ -306,7 +314,7 @@ class _Trial:
 
 
 def _over_bands(log: Array, blur: int) -> Array:
-    """ln of the mean likelihood of energies, a wheel being seen near where it stands."""
+    """ln of the mean likelihood of signals, a wheel being seen near where it stands."""
     top = float(log.max())
     mean = _blurred(np.exp(log - top).mean(axis=0), blur)
     return np.asarray(top + np.log(np.maximum(mean, 1e-300)))
@@ -349,10 +357,14 @@ def find_delay(
     begun = min(float(time[0]) for time in known)
     within = max(within[0], begun), within[1]
     waves = [deflection(record.window, within) for record in (first, second)]
-    traces = [record.traces(within) for record in (first, second)]
+    lasting = _lasting((first, second), within)
+    if not lasting:
+        return None
     range_ = float(np.log(limits[1] / limits[0]))
     ends = [float(v) for v in np.geomspace(*limits, max(2, int(range_ / np.log(_RATIO)) + 2))]
-    tried = [_Trial(waves, traces, within, baseline, span) for span in pairwise(ends)]
+    cut = any(record.wave(within).clipped for record in (first, second))
+    signals = waves, lasting.values(), within, baseline
+    tried = [_Trial(*signals, span, cut) for span in pairwise(ends)]
     trials = [trial for trial in tried if trial.enough]
     if not trials:
         return None
@@ -366,7 +378,7 @@ def find_delay(
         views[trial.centre] = [*sums, float(logs[-1].max())], share
     told = np.array([weight for weight, _ in views.values()])
     # the filters pass data in common: together they tell what they tell on average
-    weights = told.mean(axis=0) + _order(likely, (first, second), traces, within)
+    weights = told.mean(axis=0) + _order(likely, (first, second), lasting, within)
     k = int(np.argmax(weights[:-1]))
     # the mean of likelihood ratios to chance is one, however they depend on each other
     chance = float(np.log(2 * range_))
@@ -384,7 +396,19 @@ def find_delay(
     errors[k] = float(np.sqrt(weight @ (speeds - speed) ** 2))
     place = float(np.hypot(apart[1], 2**0.5 * DEFLECTION_SIGMA)) / baseline
     sigma = float(np.hypot(np.sqrt(among @ errors**2), place * speed))
-    return Delay(speed, sigma, direction, sure, best.trial.band(best.delay))
+    return Delay(speed, sigma, direction, sure, list(lasting)[best.trial.band(best.delay)])
+
+
+def _lasting(records: Sequence[Record], within: tuple[float, float]) -> dict[int, list[Trace]]:
+    """Energies of both channels by band, without bands that blows carry at both: a flat wheel
+    strikes once a turn, and both channels hear that at once."""
+    pairs = zip(*(record.traces(within) for record in records), strict=True)
+    cuts = zip(*(record.traces(within, limited=True) for record in records), strict=True)
+    return {
+        band: list(pair)
+        for band, (pair, cut) in enumerate(zip(pairs, cuts, strict=True))
+        if not all(struck(t, limited, within) for t, limited in zip(pair, cut, strict=True))
+    }
 
 
 def _log_sum(log: Array) -> Array:
@@ -412,7 +436,7 @@ def _at_once(trials: Sequence[_Trial], most: float, speed: float) -> _Likely:
 def _order(
     likely: Sequence[_Likely],
     records: Sequence[Record],
-    traces: Sequence[Sequence[Trace]],
+    traces: Mapping[int, Sequence[Trace]],
     within: tuple[float, float],
 ) -> Array:
     """ln of the likelihood of the delays by when the channels become strong, shape (delays,)."""
@@ -420,7 +444,7 @@ def _order(
     sigma = _FIRST_SIGMA / np.array([item.speed for item in likely])
     late = _LATE / (2 * (within[1] - within[0]))
     told = []
-    for band, pair in enumerate(zip(*traces, strict=True)):
+    for band, pair in traces.items():
         starts = []
         for record, trace in zip(records, pair, strict=True):
             low, high = record.window.bands[band]

@@ -14,7 +14,7 @@ from .kinematics import Motion
 from .pattern import FASTEST, SLOWEST, Match, Trace, independent, refine, scan, stretched
 from .place import Wave
 from .record import Record
-from .strength import CORE, strong_interval
+from .strength import CORE, strong_interval, struck
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def scan_channel(
         whole, record.traces(within, limited=True), window.bands, strict=True
     ):
         ways = []
-        for t in (trace, limited) if _struck(trace, limited, within) else (trace,):
+        for t in (trace, limited) if struck(trace, limited, within) else (trace,):
             interval = strong_interval(t, band[1] - band[0], within)
             if interval is None:
                 continue
@@ -103,13 +103,6 @@ def scan_channel(
     return next(
         s for s in found if s.score >= top - (_LOW_BAND_BONUS if top > HOPELESS_SCORE else 0)
     )
-
-
-def _struck(trace: Trace, limited: Trace, within: tuple[float, float]) -> bool:
-    """Whether blows carry more than half of the energy above the noise."""
-    inside = (trace.time >= within[0]) & (trace.time <= within[1])
-    total, lasts = (float(np.sum(t.energy[inside] - t.noise)) for t in (trace, limited))
-    return lasts < 0.5 * total
 
 
 @dataclass(frozen=True)

@@ -109,6 +109,18 @@ def find_passages(
     ]
 
 
+def _apart(part: Passage, whole: Passage) -> bool:
+    """Whether a part of what may be one train can be a train of its own.
+
+    What is one, by its type or as it travels, is not two before a sensor that is late or elsewhere,
+    nor is a listed one two of which one is not.
+    """
+    one = whole.known or (whole.blind is not None and whole.blind.travels)
+    if not part.confirmed or (one and (part.clock_offset or part.moved)):
+        return False
+    return part.known or not whole.known
+
+
 def _counted(passage: Passage) -> bool:
     """Whether the wheelsets of a train of no listed type were seen."""
     blind = passage.blind
@@ -176,17 +188,13 @@ def _divided(
         return [whole]
     # a part in which something travels gives the whole most of its delay
     travels = whole.known or (whole.blind is not None and whole.blind.direction != 0)
-    # what travels as one train is not two before a sensor that is late, or elsewhere
-    one = whole.blind is not None and whole.blind.travels
     for gap in sorted(gaps, key=lambda g: g[0] - g[1])[:3]:
         middle = 0.5 * (gap[0] + gap[1])
         halves = ((within[0], middle), (middle, within[1]))
         parts: list[Passage] = []
         for half in halves:
             part = find_passage(rails, half, types, limits, site, unlisted and travels)
-            if part is None or not part.confirmed:
-                break
-            if one and (part.clock_offset or part.moved):
+            if part is None or not _apart(part, whole):
                 break
             parts.append(part)
         better = len(parts) == 2 and parts[0].score + parts[1].score > 2 * whole.score + 0.1

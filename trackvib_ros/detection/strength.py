@@ -60,6 +60,13 @@ def quiet_gaps(
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(gaps > least_s)]
 
 
+def struck(trace: Trace, limited: Trace, within: tuple[float, float]) -> bool:
+    """Whether blows, that ``limited`` lacks, carry more than half of the energy above the noise."""
+    inside = (trace.time >= within[0]) & (trace.time <= within[1])
+    total, lasts = (float(np.sum(t.energy[inside] - t.noise)) for t in (trace, limited))
+    return lasts < 0.5 * total
+
+
 def excited(record: Record, within: tuple[float, float]) -> bool:
     """Whether a channel shows energy well above its floor in an interval, on enough valid bins."""
     inside = (record.window.time >= within[0]) & (record.window.time <= within[1])

@@ -119,8 +119,8 @@ def find(
     time = passage.hypotheses[0].fit.time
     start, stop = float(time.min()), float(time.max())
     heard_s = min(within[1], stop) - max(within[0], start)
-    # flats are anywhere in a train, and all of it is on record
-    whole = span[0] < start and stop < span[1]
+    # flats are anywhere in a train, and all of it is on record at a channel
+    whole = span[0] < start and float(time[:, -1].min()) < span[1]
     return passage if whole and heard_s > _LEAST_HEARD * (stop - start) else None
 
 
