@@ -37,6 +37,20 @@ def candidate(
     return Candidate(nominal, shifts, axle_fit, 0.9, free)
 
 
+def test_acceleration_holds_though_the_ends_of_a_train_lack_neighbours():
+    axles = CATALOGUE["CRH3"].axles
+    lack = np.exp(-np.minimum(axles, axles[-1] - axles) / 12.0)
+    ratios = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        shown = axles + 0.01 * lack * rng.standard_normal(axles.size)
+        found = explain([candidate(axles, shown, channels=1, seed=seed, noise=0.003)])
+        motion = next(e.motion for e in found if e.kind == "type")
+        ratios.append(motion.acceleration / motion.acceleration_sigma)
+    # 100 draws: the rms of unit normals lies within 1 +- 3 / sqrt(200)
+    assert 0.79 < np.sqrt(np.mean(np.square(ratios))) < 1.21
+
+
 def test_a_listed_train_is_its_type():
     axles = CATALOGUE["CRH3"].axles
     best = explain([candidate(axles, axles)])[0]

@@ -44,7 +44,8 @@ LISTED: tuple[Kind, ...] = ("type", "moved", "clock")
 # and 40 dB rms 0.012 m, one in twenty beyond 0.03 m; more where noise hides a pulse
 _CLASS_SIGMA = 0.03
 _LEAN_SIGMA = 0.012  # m, the same of both wheelsets of a bogie: the rms of them all
-_LEAST_NOISE = 0.005  # m, a wheelset is timed in cells of 0.1 m: finer agreement is chance
+_END_SIGMA = 0.01  # m, beside that, of outermost wheelsets (40 dB), as no neighbours precede them
+_LEAST_NOISE = 0.003  # m, the same: the scatter at 40 dB, finer agreement is chance
 _SCALE = 0.04  # catalogue types of one shape differ this much in size (CRH1 : CR400AF 6 %)
 _SCALE_VARIED = 0.08
 _SHAPE = 0.06  # m, how well the gaps of such relatives agree after scaling
@@ -119,6 +120,12 @@ def _lean(places: Array) -> Array:
     return np.asarray(lean[bogie])
 
 
+def _at_ends(places: Array) -> Array:
+    """Variance (m²) of wheelsets by neighbours that they lack before the train or behind it."""
+    near = [np.exp(-2 * np.abs(places - end) / FAR) for end in (places[0], places[-1])]
+    return np.asarray(_END_SIGMA**2 * (near[0] + near[1]), dtype=np.float64)
+
+
 def _noise(candidate: Candidate) -> float:
     """Scatter of wheelsets of one class about their median (m), outliers limited."""
     alike = classes(candidate.places)
@@ -189,7 +196,8 @@ def _model(
     rest = rest - start.distance_at(fit.time[seen])
     excess = np.maximum(1.0, np.abs(fit.residual[seen]) / (_OUTLIER * noise))
     z = np.stack([effect[seen] for effect in effects], axis=1)
-    factor = linalg.cho_factor(np.diag((noise * excess) ** 2) + z @ z.T, lower=True)
+    ends = np.broadcast_to(_at_ends(candidate.places), seen.shape)[seen]
+    factor = linalg.cho_factor(np.diag((noise * excess) ** 2 + ends) + z @ z.T, lower=True)
     x = np.stack([np.ones_like(t), t, 0.5 * t * t], axis=1)
     solved = linalg.cho_solve(factor, np.column_stack([x, rest]))
     prior = PRIOR_ACCELERATION**-2
