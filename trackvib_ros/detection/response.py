@@ -27,6 +27,7 @@ from .evidence import PRIOR_UNKNOWN, half_interval
 from .kinematics import Motion
 from .record import Record
 from .response_equal import ends_sigma, proportions, unlisted
+from .response_loads import loaded
 from .response_model import (
     USUAL_MISFIT,
     Observation,
@@ -206,10 +207,18 @@ class ResponsePassage:
         if best.covariance is not None:
             covariance[1:, 1:] = self.unit * best.covariance
         covariance[0, 0] = (self.middle[1] * best.speed) ** 2
+        covariance[1, 1] += (best.acceleration * self.passing_sigma) ** 2
         if not self.listed:
             covariance[1, 1] += (CAR[1] * best.speed) ** 2
         half = 0.5 * best.train.span
         return Motion(self.middle[0], half, best.speed, best.acceleration, covariance)
+
+    @property
+    def passing_sigma(self) -> float:
+        """How far (s) what answers may lie from the reference: all channels share one speed, and
+        a bridge answers where it is soft."""
+        apart = np.array([c.x - self.channels[0].x for c in self.channels])
+        return float(np.hypot(self.middle[1], np.sqrt(np.mean(apart**2)) / self.best.speed))
 
     @property
     def relative(self) -> float:
@@ -348,6 +357,7 @@ def find_response(
     unit = tempered(top)
     likely = [fit for fit in distinct(fits) if fit.evidence > top - KEPT * unit / CORRELATED]
     weight = np.exp([(fit.evidence - top) / unit for fit in likely])
+    likely = [_by_loads(search, fit) for fit in likely]
     channels = tuple(channel for channel, _ in used)
     told = ResponsePassage(
         tuple(likely),
@@ -376,6 +386,12 @@ def find_response(
         direction=_direction(channels, placed, told.best.speed) if told.listed else 0,
         spectral=_spectral(told.best, used[0][1]) if told.listed else None,
     )
+
+
+def _by_loads(search: Search, fit: ResponseFit) -> ResponseFit:
+    """The fit with the motion of the one that has a load for every wheelset."""
+    own = loaded(search, fit.common or fit)
+    return replace(fit, speed=own.speed, acceleration=own.acceleration, covariance=own.covariance)
 
 
 def _direction(

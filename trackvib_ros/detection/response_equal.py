@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .kinematics import PRIOR_ACCELERATION
 from .response_search import FINE, KEPT, PASSED, PASSED_SPREAD, ResponseFit, Search, ranked
-from .unlisted import CAR, EqualCars, like, starts
+from .unlisted import CAR, FEWEST, EqualCars, like, starts
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def _harmonics(fit: ResponseFit) -> list[ResponseFit]:
     assert fit.cars is not None
     found = []
     for factor in (0.5, 2.0):
-        number = max(2, round(fit.cars.cars * factor))
+        number = max(FEWEST, round(fit.cars.cars * factor))
         v, a = factor * fit.speed, factor * fit.acceleration
         found += [replace(fit.of(kind), speed=v, acceleration=a) for kind in fit.cars.kinds(number)]
     return found
@@ -45,14 +45,14 @@ def unlisted(given: Search, listed: Sequence[ResponseFit]) -> list[ResponseFit]:
     search = Search(given.seen, (sizes[0], sizes[1]))
     found = []
     for cars in starts():
-        near = search.coarse(cars.train, False, bent=False, spread=_ABOUT)
+        near = search.coarse(cars.train, False, bent=False, about=_ABOUT)
         found += [(fit, cars) for fit in near[:1]]
     pool: list[ResponseFit] = []
     plain: list[ResponseFit] = []
     if found:
         found.sort(key=lambda pair: -pair[0].evidence)
         fit, cars = found[0]
-        best = search.refined(search.coarse(cars.train, False, spread=_ABOUT)[:2] or [fit])[0]
+        best = search.refined(search.coarse(cars.train, False, about=_ABOUT)[:2] or [fit])[0]
         best = _plain(search, best.of(cars))
         plain.append(best)
         pool.append(best)
@@ -143,9 +143,8 @@ def changed(search: Search, fit: ResponseFit, cars: EqualCars) -> ResponseFit:
     keep = [b - a for b, a in zip(before, after, strict=True)]
     shifts = np.unique(np.round([0.0, *keep], 3)) / fit.speed
     total = np.zeros(shifts.size)
-    for k, model in enumerate(fit.models):
-        combs = search.own(k, model, new)
-        total += model.evidence(combs, new.places.size, model.centre + shifts)[0]
+    for model in fit.models:
+        total += model.evidence(new.comb(model), new.places.size, model.centre + shifts)[0]
     i = int(np.argmax(total))
     models = tuple(replace(m, centre=float(m.centre + shifts[i])) for m in fit.models)
     expected = PASSED * new.train.span / search.duration

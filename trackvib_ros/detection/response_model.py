@@ -176,9 +176,13 @@ class Model:
     centre: float = 0.0
     deviation: tuple[float, ...] = ()
 
-    def comb(self, places: Array, speed: Array, acceleration: Array) -> ComplexArray:
-        """:func:`comb` with all that the model needs."""
+    def comb(
+        self, places: Array, speed: Array, acceleration: Array, loads: Sequence[float] = ()
+    ) -> ComplexArray:
+        """:func:`comb` with all that the model needs, and with the loads of the wheelsets."""
         weights = signs(places.size) if self.deviation else None
+        if loads:
+            weights = np.array(loads) * (np.ones((1, places.size)) if weights is None else weights)
         return comb(places, self.spectrum.f, speed, acceleration, weights)
 
     @property
@@ -291,6 +295,40 @@ class Model:
         centroid = time @ energy
         width = np.sqrt(np.maximum(time**2 @ energy - centroid**2, 0.0))
         return np.asarray(centres + centroid), np.asarray(width)
+
+    def information(
+        self, places: Array, speed: float, acceleration: float, loads: Sequence[float]
+    ) -> tuple[Array, Array]:
+        """Normal matrix and right side of a Gauss-Newton step, the response solved for.
+
+        For the loads of all wheelsets, the speed and the acceleration of the middle; one response
+        for all wheelsets.
+        """
+        s, t, weight = self.spectrum, self.knots, 2 * self.spectrum.share / self._variance()
+
+        def late(v: float, a: float) -> Array:
+            root = np.sqrt(np.maximum(v * v + 2 * a * places, 0.01 * v * v))
+            return np.asarray(2 * places / (v + root))
+
+        times, small = late(speed, acceleration), 1e-5 * speed
+        per_speed = (late(speed + small, acceleration) - times) / small
+        per_acceleration = (late(speed, acceleration + 1e-5) - times) / 1e-5
+        size = np.array(loads)
+        each = np.exp(-2j * np.pi * np.outer(s.f, times + self.centre))
+        waves = self._shape(size.size, t.size)[:, None] * np.exp(-2j * np.pi * np.outer(s.f, t))
+        own = (each @ size)[:, None] * waves
+        weighted = np.conj(own) * weight[:, None]
+        normal = np.real(weighted.T @ own) + np.eye(t.size)
+        knots = np.linalg.solve(normal, np.real(weighted.T @ s.y))
+        each *= (waves @ knots)[:, None]
+        late_all = -2j * np.pi * s.f[:, None] * (each * size)
+        steps = np.stack([late_all @ per_speed, late_all @ per_acceleration], axis=1)
+        columns = np.concatenate([each, steps], axis=1)
+        left = s.y - each @ size
+        cross = np.real(weighted.T @ columns)
+        weighted = np.conj(columns) * weight[:, None]
+        gain = np.real(weighted.T @ left)
+        return np.real(weighted.T @ columns) - cross.T @ np.linalg.solve(normal, cross), gain
 
     def shares(
         self, groups: Sequence[Array], places: Array, speed: float, acceleration: float

@@ -27,7 +27,7 @@ CORRELATED = 3.0
 Mean square of error over sigma of the speed on computed passages when counted as independent."""
 
 COARSE = 8.0
-"""Shortest waves that are compared at first (m)."""
+"""Shortest waves that are compared at first (m), shorter ones where a train is short."""
 
 PASSED, PASSED_SPREAD = 0.95, 0.15
 """Part of the time between first and last wheelset in which 5 to 95 % of the energy come; its
@@ -39,11 +39,13 @@ KEPT = 15.0
 _MOST_MISFIT, _LEAST_MISFIT = 0.5, 0.001  # part of the spectrum that no response explains
 _DEVIATIONS = 0.1, 0.3, 1.0  # power of what wheelsets of a car differ by, over the misfit
 _REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
+_SUPPORTS = (_REACHES[0], _RINGS[0]), (_REACHES[2], _RINGS[1])  # of a first look
 _MIDDLE, FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
 _DECELERATION = 0.4  # of the speed, largest change over a passage
 _LARGEST = 1.0  # m/s²
 _PLACED = 0.45  # of its own width, distance of the centroid of a response from its wheelset
+_WAVES = 16  # on a train, at least, at first: on fewer there is nothing to compare
 _NEIGHBOUR = 0.3  # cycles at the ends of a train between trial motions
 _PART = 6  # wheelsets, at least, whose amplitude is measured by itself
 _SHRUNK, _WEAKEST, _HEAVIEST = 1.5, 0.65, 2.5
@@ -64,6 +66,7 @@ class ResponseFit:
         evidence: ln of the marginal likelihood over that of a disturbance.
         common: the fit with one response for all wheelsets, if they may differ here.
         cars: what the train is made of, if it is none of the catalogue.
+        loads: of the wheelsets over their mean, if they were sought.
     """
 
     train: TrainType
@@ -75,6 +78,7 @@ class ResponseFit:
     covariance: Array | None = None
     common: ResponseFit | None = None
     cars: EqualCars | None = None
+    loads: tuple[float, ...] = ()
 
     def of(self, cars: EqualCars) -> ResponseFit:
         """The fit with another train of equal cars."""
@@ -84,6 +88,11 @@ class ResponseFit:
     def places(self) -> Array:
         """Distance of every wheelset behind the middle of the train (m)."""
         return self.train.oriented(self.reverse) - 0.5 * self.train.span
+
+    def comb(self, model: Model) -> ComplexArray:
+        """:meth:`Model.comb` of its motion."""
+        v, a = np.array([self.speed]), np.array([self.acceleration])
+        return model.comb(self.places, v, a, self.loads)
 
     @property
     def amplitudes(self) -> Array:
@@ -112,12 +121,14 @@ class ResponseFit:
 
 
 class Search:
-    """Trial motions against some observations of one passage."""
+    """Trial motions against some observations of one passage.
+
+    The speed is that at which the middle of the train passes, taken as the same at all channels.
+    """
 
     def __init__(self, seen: Sequence[Observation], limits: tuple[float, float]) -> None:
         self.seen = list(seen)
         self.limits = limits
-        self.epoch = self.seen[0].epoch
         self.duration = min(s.duration for s in self.seen)
 
     def models(self, speed: float, wave: float, reach: float, ring: float) -> list[Model]:
@@ -128,57 +139,63 @@ class Search:
             for s in self.seen
         ]
 
-    def combs(self, k: int, model: Model, places: Array, v: Array, a: Array) -> ComplexArray:
-        """Of trial motions, stated at the common epoch, for observation ``k``."""
-        return model.comb(places, v + a * (self.seen[k].epoch - self.epoch), a)
-
     def coarse(
         self,
         train: TrainType,
         reverse: bool,
         bent: bool = True,
-        spread: tuple[float, float] = _RANGE,
+        about: tuple[float, float] | None = None,
     ) -> list[ResponseFit]:
-        """The best motions of a type on waves from :data:`COARSE`."""
+        """The best motions of a train on long waves.
+
+        Args:
+            train, reverse: the train.
+            bent: whether it may accelerate.
+            about: range of the logarithm of its speed, for a train of free proportions: with short
+                waves and short responses some of them look like any burst.
+        """
+        wave = COARSE if about else min(COARSE, train.span / _WAVES)
         expected = PASSED * train.span / self.duration
-        speeds = expected * np.exp(np.arange(*spread, _NEIGHBOUR * COARSE / train.span))
+        speeds = expected * np.exp(np.arange(*(about or _RANGE), _NEIGHBOUR * wave / train.span))
         speeds = speeds[(speeds >= self.limits[0]) & (speeds <= self.limits[1])]
         if not speeds.size:
             return []
-        bend = 4 * COARSE / self.duration**2
+        bend = 4 * wave / self.duration**2
         most = min(_LARGEST, _DECELERATION * expected / self.duration) if bent else 0.0
         bends = np.clip(
             np.arange(-np.ceil(most / bend), np.ceil(most / bend) + 1) * bend, -most, most
         )
         places = train.oriented(reverse) - 0.5 * train.span
-        models = self.models(expected, COARSE, _REACHES[0], _RINGS[0])
-        if not all(model.spectrum.usable for model in models):
-            return []
-        spacing = max(0.5 * _REACHES[0] / expected, 0.02)
-        far = np.ceil(0.15 * self.duration / spacing)
-        centres = np.arange(-far, far + 1) * spacing
         prior = -0.5 * (np.log(speeds / expected) / PASSED_SPREAD) ** 2
         found = []
-        for a in bends:
-            each = [
-                m.evidence(
-                    self.combs(k, m, places, speeds, np.full(speeds.size, a)), places.size, centres
-                )
-                for k, m in enumerate(models)
-            ]
-            total = prior - 0.5 * (a / PRIOR_ACCELERATION) ** 2
-            total = total + sum(e.max(axis=1) for e in each)
-            before, after = np.r_[-np.inf, total[:-1]], np.r_[total[1:], -np.inf]
-            for i in np.flatnonzero((total >= before) & (total >= after)):
-                placed = tuple(
-                    replace(m, centre=float(centres[np.argmax(e[i])]))
-                    for m, e in zip(models, each, strict=True)
-                )
-                v, score = float(speeds[i]), float(total[i])
-                found.append(ResponseFit(train, reverse, v, float(a), score, placed))
+        # with a response as long as a short train any motion repeats itself, and one that is too
+        # short explains no long one
+        for reach, ring in _SUPPORTS[:1] if about else _SUPPORTS:
+            models = self.models(expected, wave, reach, ring)
+            if not all(model.spectrum.usable for model in models):
+                continue
+            spacing = max(0.5 * reach / expected, 0.02)
+            far = np.ceil(0.15 * self.duration / spacing)
+            centres = np.arange(-far, far + 1) * spacing
+            for a in bends:
+                bent_all = np.full(speeds.size, a)
+                each = [
+                    m.evidence(m.comb(places, speeds, bent_all), places.size, centres)
+                    for m in models
+                ]
+                total = prior - 0.5 * (a / PRIOR_ACCELERATION) ** 2
+                total = total + sum(e.max(axis=1) for e in each)
+                before, after = np.r_[-np.inf, total[:-1]], np.r_[total[1:], -np.inf]
+                for i in np.flatnonzero((total >= before) & (total >= after)):
+                    placed = tuple(
+                        replace(m, centre=float(centres[np.argmax(e[i])]))
+                        for m, e in zip(models, each, strict=True)
+                    )
+                    v, score = float(speeds[i]), float(total[i])
+                    found.append(ResponseFit(train, reverse, v, float(a), score, placed))
         apart: list[ResponseFit] = []
         for fit in ranked(found):
-            near = 2 * _NEIGHBOUR * COARSE / train.span
+            near = 2 * _NEIGHBOUR * wave / train.span
             if all(abs(fit.speed / other.speed - 1) > near for other in apart):
                 apart.append(fit)
         return apart[:_PEAKS]
@@ -200,8 +217,8 @@ class Search:
         expected = PASSED * fit.train.span / self.duration
         out = -0.5 * (a / PRIOR_ACCELERATION) ** 2
         out = out - 0.5 * (np.log(v / expected) / PASSED_SPREAD) ** 2
-        for k, m in enumerate(fit.models):
-            combs = self.combs(k, m, places, v, a)
+        for m in fit.models:
+            combs = m.comb(places, v, a, fit.loads)
             out = out + m.evidence(combs, places.size, np.array([m.centre]))[:, 0]
         return out
 
@@ -251,7 +268,7 @@ class Search:
                     model = Model(spectrum, r / reference, r / reference + ring, misfit)
                     free = max(reach - r, 0.0) / reference
                     centres = old.centre + np.linspace(-free, free, 5 if free else 1)
-                    value, placed = self._placed(k, model, fit, centres)
+                    value, placed = self._placed(model, fit, centres)
                     if best is None or value > best[0]:
                         best = value, placed
             # too few coefficients on finer waves: the coarser ones stay
@@ -276,8 +293,8 @@ class Search:
     def weighted(self, fit: ResponseFit) -> ResponseFit:
         """The fit with the misfits of most evidence, of one octave after the other."""
         models = []
-        for k, model in enumerate(fit.models):
-            combs, here = self.own(k, model, fit), np.array([model.centre])
+        for model in fit.models:
+            combs, here = fit.comb(model), np.array([model.centre])
             best, top = model, float(model.evidence(combs, fit.places.size, here)[0, 0])
             for octave, factor in itertools.product(range(OCTAVES), (0.5, 2.0)):
                 while True:
@@ -334,7 +351,7 @@ class Search:
         Wheelsets may differ by what the common response leaves over, and most where that is most.
         """
         out = []
-        for k, model in enumerate(fit.models):
+        for model in fit.models:
             here = np.array([model.centre])
             trials = [
                 replace(
@@ -345,7 +362,7 @@ class Search:
                 for deviation in _DEVIATIONS
                 for part in (1.0, 0.5, 0.25)
             ]
-            placed = [self._placed(k, trial, fit, here) for trial in trials]
+            placed = [self._placed(trial, fit, here) for trial in trials]
             out.append(max(placed, key=lambda pair: pair[0])[1])
         return out
 
@@ -358,15 +375,13 @@ class Search:
         for k, each in enumerate(trials):
             centres = np.unique(np.round([f.models[k].centre for f in fits], 4))
             distinct = {(m.before, m.after, m.misfit, m.deviation): m for m in each}
-            placed = [self._placed(k, model, fit, centres) for model in distinct.values()]
+            placed = [self._placed(model, fit, centres) for model in distinct.values()]
             models.append(max(placed, key=lambda pair: pair[0])[1])
         return replace(fit, models=tuple(models))
 
-    def _placed(
-        self, k: int, model: Model, fit: ResponseFit, centres: Array
-    ) -> tuple[float, Model]:
-        """Evidence of a model for observation ``k`` at the best of its centres."""
-        values = model.evidence(self.own(k, model, fit), fit.places.size, centres)[0]
+    def _placed(self, model: Model, fit: ResponseFit, centres: Array) -> tuple[float, Model]:
+        """Evidence of a model at the best of its centres."""
+        values = model.evidence(fit.comb(model), fit.places.size, centres)[0]
         i = int(np.argmax(values))
         return float(values[i]), replace(model, centre=float(centres[i]))
 
@@ -418,7 +433,7 @@ class Search:
             before = reach / fit.speed
             spectrum = Spectrum(self.seen[k], 2 * before + ring, top)
             model = replace(old, spectrum=spectrum, before=before, after=before + ring)
-            combs = self.own(k, model, fit)
+            combs = fit.comb(model)
             values.append(model.evidence(combs, fit.places.size, centres)[0])
             place, width = model.centroids(combs, fit.places.size, centres)
             places.append(place)
@@ -429,11 +444,6 @@ class Search:
         mean = float(weight @ place)
         variance = float(weight @ ((place - mean) ** 2 + (_PLACED * width) ** 2))
         return old.spectrum.epoch + mean, float(np.sqrt(variance))
-
-    def own(self, k: int, model: Model, fit: ResponseFit) -> ComplexArray:
-        """:meth:`combs` of the motion of a fit."""
-        v, a = np.array([fit.speed]), np.array([fit.acceleration])
-        return self.combs(k, model, fit.places, v, a)
 
     def refined(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """The likely ones of coarse fits on finer and finer waves, most probable first."""
