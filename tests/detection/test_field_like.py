@@ -213,8 +213,10 @@ def test_nothing_finite_is_an_error(samples, rate):
     [
         (1000.0, ["a", "b"], "real numbers"),
         (1000.0, np.ones(5) + 1j, "real numbers"),
-        ([0.0, np.nan, 2.0], np.ones(3), "finite"),
+        (1000.0, [np.ones(3), np.ones(4)], "fill the shorter"),
+        ([0.0, np.nan, 2.0], np.ones(3), "time\\[1\\] = nan"),
         ([0.0, 0.0, 0.0], np.ones(3), "increase"),
+        (np.float32(1.7e9) + np.arange(0, 3, 1e-3, np.float32), np.ones(3000), "single precision"),
         ([0.0, 2e-3, 1e-3 - 1.0], np.ones(3), "sample 2 is 1.001 s before an earlier one"),
         (np.r_[0:2:1e-3, 1.5:3:1e-3], np.ones(3500), "set back"),
         (np.arange(0.0, 3000.0), np.ones(3000), "must be in s"),

@@ -91,7 +91,13 @@ def detect(
 def _numbers(name: str, values: ArrayLike) -> Array:
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(np.float64), np.nan)
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise InputError(
+            f"{name} must be one rectangular array; if channels differ in length or rate, fill the "
+            "shorter ones with NaN, or give each to a TrainDetector in blocks of its own rate"
+        ) from None
     if array.dtype.kind not in "fiubO":
         raise InputError(f"{name} of type {array.dtype} must be real numbers")
     try:
@@ -115,8 +121,12 @@ def _in_order(clock: Array, data: Array) -> tuple[Array, Array]:
     Raises:
         InputError: times are not finite, out of range, or go back by a second and more.
     """
-    if not (np.isfinite(clock).all() and np.max(np.abs(clock)) < 9e9):
-        raise InputError("time must be finite and within 9e9 s of 0; it is in s, not ms or ns")
+    wrong = np.flatnonzero(~(np.abs(clock) < 9e9))
+    if wrong.size:
+        raise InputError(
+            f"time[{wrong[0]}] = {clock[wrong[0]]} must be finite and within 9e9 s of 0 (it is in "
+            f"s, not ms or ns); {wrong.size} of {clock.size} are not: leave those samples out"
+        )
     back = np.maximum.accumulate(clock) - clock
     worst = int(np.argmax(back))
     if not back[worst]:
@@ -170,14 +180,13 @@ def _grid(clock: Array) -> tuple[int, list[tuple[int, int]], NDArray[np.int64]]:
     Times may be rounded, jitter, or be those of blocks of samples: the step is the mean over
     pieces, and a gap is what is longer than the samples with the time before it take.
     """
-    if clock[-1] <= clock[0]:
-        raise InputError("time must increase from sample to sample (s)")
     span = min(_DENSE, len(clock) - 1)
     typical = float(np.median(clock[span:] - clock[:-span])) / span
-    if typical <= 0:
+    if typical <= 0 or clock[-1] <= clock[0]:
         raise InputError(
-            f"time is the same for {span} samples and more, too coarse for their rate; give the "
-            "rate (Hz), or times (s) of a finer clock"
+            f"time must increase, but is the same for {span} samples and more, too coarse for "
+            "their rate (seconds of an epoch in single precision?); give the rate (Hz), or times "
+            "(s) of a finer clock in double precision"
         )
     starts = np.flatnonzero(np.diff(clock, prepend=-np.inf) > 0)
     steps, counts = np.diff(clock[starts]), np.diff(starts)

@@ -110,6 +110,8 @@ class Closing:
         """The events at the end of an event; what its trains teach is kept, or to be studied."""
         records, within = ended.records, ended.within
         found = self.search(records, within) if ended.found is None else ended.found
+        # part of another train has the pattern of a type at channels that contradict each other
+        found = [p for p in found if not (p.clock_offset and report.cut_off(records, p))]
         if ended.begun is not None:
             rails, start_ns = ended.begun
             whole = _whole(found, (start_ns - ended.origin_ns) * 1e-9, within)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,31 +182,47 @@ def unclear(
 
 def _window_flags(records: Sequence[Record], passage: Passage) -> list[str]:
     """Flags from the samples: clipped, gaps, record shorter than the train."""
-    flags = set()
-    start, stop = passage.interval
-    margin = _MARGIN_S
-    if passage.known:
-        best = passage.hypotheses[0]
-        margin = _MARGIN / float(best.fit.motion.speed_at(best.mid_time))
-    for record in records:
+    flags = cut_off(records, passage)
+    for record, start, stop in _passing(records, passage):
         window = record.window
-        if passage.known:
-            way = passage.direction * (record.channel.x - passage.traces[0].x)
-            start, stop = (float(best.fit.motion.time_at(best.places[i] + way)) for i in (0, -1))
         inside = (window.time >= start) & (window.time <= stop)
-        if record.channel.layer != "rail" or not inside.any():
-            continue
         if clipped(window, inside):
             flags.add("clipped")
         if np.mean(window.holes[inside]) > 0.002 or not window.valid[inside].all():
             flags.add("gaps")
-        if start - window.time[0] < margin:
-            flags.add("truncated_start")
-        if window.time[-1] - stop < margin:
-            flags.add("truncated_end")
     if passage.known and _overlapped(passage):
         flags.add("overlap")
     return sorted(flags)
+
+
+def cut_off(records: Sequence[Record], passage: Passage) -> set[str]:
+    """The ends of a train, ``truncated_start`` or ``truncated_end``, that a record hardly shows."""
+    margin = _MARGIN_S
+    if passage.known:
+        best = passage.hypotheses[0]
+        margin = _MARGIN / float(best.fit.motion.speed_at(best.mid_time))
+    flags = set()
+    for record, start, stop in _passing(records, passage):
+        if start - record.window.time[0] < margin:
+            flags.add("truncated_start")
+        if record.window.time[-1] - stop < margin:
+            flags.add("truncated_end")
+    return flags
+
+
+def _passing(
+    records: Sequence[Record], passage: Passage
+) -> Iterator[tuple[Record, float, float]]:
+    """The rail channels that show a train, from when to when (s)."""
+    start, stop = passage.interval
+    for record in records:
+        if passage.known:
+            best = passage.hypotheses[0]
+            way = passage.direction * (record.channel.x - passage.traces[0].x)
+            start, stop = (float(best.fit.motion.time_at(best.places[i] + way)) for i in (0, -1))
+        time = record.window.time
+        if record.channel.layer == "rail" and np.any((time >= start) & (time <= stop)):
+            yield record, start, stop
 
 
 def _overlapped(passage: Passage) -> bool:
@@ -284,7 +300,8 @@ def _train(
     speed, sigma = found.value, found.sigma
     first, last = stated.ends(passage, speed)
     if not known:
-        quality = [*quality, "unknown_type"]
+        # its wheelsets are those of the nearest type
+        quality = [*quality, "unknown_type", "axle_count_not_confident"]
     passing_sigma = 2**0.5 * fit.scale / speed
     summary = Summary(
         sensors=names,

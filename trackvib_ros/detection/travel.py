@@ -42,6 +42,10 @@ _LONGEST = 2000.0  # m of train; a longer vibration is something slower, or none
 _LEAST_GAIN = 25.0  # e^25 outweighs the 10^6 motions tried, and one error in 10^4 passages
 _LEAST_CORRELATION = 0.5  # of the energies, which all trains show
 _CANDIDATES = 5  # speeds that are compared with all filters
+_SAME = 1.0  # m about a delay: beyond, another wheelset is taken for this one
+SURE = 0.995
+"""Least probability of a delay that nothing else confirms: a wrong one lies beyond any interval and
+may take a tenth of the 5 % that one of 95 % misses."""
 _CELLS, _WIDE = 6, 4.0  # either side of a mean, that hold a density; its standard deviations there
 _CLIP = 5.0  # rms, above which a sample of the waveform counts no more
 
@@ -59,6 +63,7 @@ class Travel:
             independent.
         correlation: of the waveforms below 100 Hz, of the energies.
         band: whose energies agree best.
+        sure: probability of this delay among those that differ.
     """
 
     motion: Motion
@@ -67,6 +72,7 @@ class Travel:
     lead: float
     correlation: tuple[float, float]
     band: int
+    sure: float
 
     @property
     def clear(self) -> bool:
@@ -75,6 +81,7 @@ class Travel:
             self.gain > _LEAST_GAIN
             and self.lead > _LEAST_GAIN
             and self.correlation[1] > _LEAST_CORRELATION
+            and self.sure > SURE
         )
 
 
@@ -209,6 +216,10 @@ class _Candidate:
     lead: float
     band: int
 
+    def differs(self, other: _Candidate) -> bool:
+        """Whether they take different wheelsets for one."""
+        return abs(self.delay - other.delay) > _SAME / min(self.speed, other.speed)
+
 
 def _together(pair: Pair, one: _Candidate, among: Sequence[_Candidate], duration: float) -> float:
     """Gain of a delay under the filters of all candidates: only so do they see the same data."""
@@ -299,8 +310,13 @@ def search(pair: Pair, limits: tuple[float, float]) -> Travel | None:
     if not found:
         return None
     found = sorted(found, key=lambda c: -c.gain)[:_CANDIDATES]
-    chosen = max(found, key=lambda c: _together(pair, c, found, duration))
-    return _refined(pair, pair.baseline / chosen.delay, chosen.bend, chosen.band, chosen.lead)
+    # the filters pass data in common: together they tell what they tell on average
+    gains = np.array([_together(pair, c, found, duration) for c in found]) / len(found)
+    k = int(np.argmax(gains))
+    # equal cars have delays that are as likely as the right one
+    others = [g for g, c in zip(gains, found, strict=True) if c.differs(found[k])]
+    sure = 1 / (1 + float(np.sum(np.exp(np.array(others) - gains[k]))))
+    return _refined(pair, found[k], sure)
 
 
 def _features_under(pair: Pair, motion: Motion, direction: int) -> list[tuple[Array, Array, float]]:
@@ -381,15 +397,15 @@ def _moments(cost: Callable[[float], float]) -> tuple[float, float]:
     return mean, spread
 
 
-def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> Travel:
-    direction = 1 if signed > 0 else -1
-    rough = abs(signed)
+def _refined(pair: Pair, one: _Candidate, sure: float) -> Travel:
+    direction = 1 if one.delay > 0 else -1
+    rough, band = pair.baseline / abs(one.delay), one.band
     epoch = 0.5 * (pair.within[0] + pair.within[1])
     duration = pair.within[1] - pair.within[0]
     # one unit of either parameter moves the delay by 0.1 m of travel, of the second at the ends
     unit_v = 0.1 * rough / pair.baseline
     unit_a = 0.2 * rough / (pair.baseline * duration)
-    start_a = bend * rough
+    start_a = one.bend * rough
 
     def motion_at(p: Array) -> Motion:
         speed = max(rough + unit_v * float(p[0]), 0.3 * rough)
@@ -430,7 +446,8 @@ def _refined(pair: Pair, signed: float, bend: float, band: int, lead: float) -> 
         Motion(epoch, 0.0, motion.speed, motion.acceleration, covariance),
         direction,
         _agreement(pair, motion, direction, even)[0],
-        lead,
+        one.lead,
         (wave, energy),
         band,
+        sure,
     )
