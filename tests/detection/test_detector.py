@@ -281,6 +281,18 @@ def test_noise_alone_is_silent():
     assert events == []
 
 
+def test_wheelsets_of_the_nearest_type_are_no_confident_count():
+    """One rail without a deflection: nothing but the pattern of a type that does not explain it."""
+    axles = CATALOGUE["CRH3"].axles
+    own = Catalogue(tuple(t for t in CATALOGUE if t.name in ("locomotive_hauled", "metro")))
+    told = passages(run(record([Passage(axles, 40.0)], RAILS[:1], 20), RAILS[:1], catalogue=own))
+    for passage in told:
+        assert passage.values["type"] == "unknown"
+        counted = passage.values.get("axle_count_confidence", 0.0) >= 0.8
+        assert counted or "axle_count_not_confident" in passage.quality
+    assert told
+
+
 def test_unknown_type_is_told_as_unknown():
     own = Catalogue(tuple(t for t in CATALOGUE if not t.name.startswith("articulated")))
     truth = Passage(CATALOGUE["articulated"].axles, 25.0)

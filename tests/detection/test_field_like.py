@@ -105,6 +105,15 @@ def test_the_middle_of_a_train_that_no_type_explains_is_told_by_its_delay():
     assert abs(speed.value - middle) < 3 * speed.sigma < 0.09 * middle
 
 
+def test_the_middle_of_a_train_is_no_shorter_train_before_a_wrong_clock():
+    """Told as an ICE2, a third too fast, before the channels were held against each other."""
+    s = stand_in(31_000_006, train="freight_boxes")
+    first = round((s.axle_times(0.0)[0] + 2.0) * s.rate)
+    part = s.samples[first : first + round(5 * s.rate)]
+    told = of(detect(s.rate, part, s.channels, catalogue()), "passage")
+    assert not [p for p in told if p.values["type"] != "unknown"]
+
+
 def test_a_tight_record_in_blocks_of_any_size():
     s = stand_in(SEEDS["figures"] + 3, shape="tight", rate=1000.0, train="class_425", snr_db=25)
     data = (s.samples / np.abs(s.samples).max()).astype(np.float32)

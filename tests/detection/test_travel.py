@@ -6,7 +6,8 @@ import pytest
 from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
 from trackvib_ros.detection.blind import _is_train
-from trackvib_ros.detection.travel import BROAD, CELL, FINE, band_pass
+from trackvib_ros.detection.pattern import Trace
+from trackvib_ros.detection.travel import BROAD, CELL, FINE, Pair, Series, band_pass, search
 from trackvib_ros.detection.wheelsets import find
 
 RATE = 2000
@@ -157,6 +158,33 @@ def test_what_reaches_both_channels_at_once_is_no_train():
     events = detect(RATE, x, RAILS)
     assert [e for e in events if e.kind == "arrival"]
     assert not [e for e in events if e.kind == "passage" and e.values["grade"] == CONFIRMED]
+
+
+@pytest.mark.parametrize("equal", [True, False])
+def test_a_delay_by_a_wagon_more_is_as_likely_inside_a_train_of_equal_wagons(equal):
+    """The middle of a train on record, of which only energies show anything."""
+    rng = np.random.default_rng(4)
+    speed, apart, step = 25.0, 30.0, 0.01
+    pitch = 20.0 + (0.0 if equal else rng.uniform(-4, 4, 60))
+    wagons = np.cumsum(np.broadcast_to(pitch, 60)) - 600
+    wheelsets = np.concatenate([wagons + x for x in (0.0, 1.8, 13.2, 15.0)])
+    time = step * np.arange(1600)
+    traces = []
+    for x in (0.0, apart):
+        off = speed * time[:, None] - x - wheelsets
+        level = np.exp(-0.5 * (off / 0.5) ** 2).sum(axis=1) + 0.01
+        energy = level * rng.chisquare(6, time.size) / 6
+        known = np.ones(time.size, dtype=bool)
+        traces.append([Trace(f"at {x}", x, time, energy, known, 0.01, step)])
+    still = Series(time, np.zeros(time.size), known)
+    found = search(Pair((still, still), (traces[0], traces[1]), apart, (0.0, 16.0)), (10.0, 115.0))
+    assert found is not None and found.clear
+    off = found.motion.speed - speed
+    if equal:
+        assert abs(off) > 0.3 * speed and abs(off) < 2 * found.doubt
+        assert found.sure < 0.95
+    else:
+        assert abs(off) < 0.02 * speed and found.doubt < 0.001 * speed
 
 
 def test_the_blows_of_a_flat_wheel_are_no_bogies():

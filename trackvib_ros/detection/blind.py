@@ -24,6 +24,7 @@ CONFIDENT = 0.8
 """Least probability of a number of wheelsets that is told without reserve."""
 
 
+_WAY = 0.95  # probability of a delay that tells the direction
 _PULSE_CELLS = 60  # of :data:`travel.CELL`
 _EXPLAINED = 0.9  # of a signal's variance, at which no other is needed
 _BOTH = 1 / 3  # least height of a wheelset's pulse at one channel over that at the other, usual 1
@@ -255,6 +256,9 @@ def _two_channels(
     both = levels.min(axis=0) > _BOTH * np.abs(levels).max(axis=0)
     start = float(pair.axis(found.motion, found.direction)[0]) + 0.5 * travel.CELL
     motion, places, place_sigma = _placed(a, b, found, start + wheelsets.place)
+    covariance = motion.covariance.copy()
+    covariance[1, 1] += found.doubt**2
+    motion = replace(motion, covariance=covariance)
     times = motion.time_at(places)
     middle = float(motion.time_at(0.5 * float(places[0] + places[-1])))
     speed = float(motion.speed_at(middle))
@@ -269,8 +273,8 @@ def _two_channels(
         time_sigma=np.sqrt(wheelsets.sigma**2 + place_sigma**2 + _SHAPE**2)
         / motion.speed_at(times),
         # bogies further apart than wheelsets are: one pulse for both wheelsets of a bogie
-        regular=wheelsets.certainty if paired.mean() > _PAIRED else min(wheelsets.certainty, 0.5),
-        direction=found.direction,
+        regular=min(wheelsets.certainty, found.sure, 1.0 if paired.mean() > _PAIRED else 0.5),
+        direction=found.direction if found.sure > _WAY else 0,
         correlation=found.correlation[1],
         travels=_is_train(wheelsets.place[both], paired[both]),
         method="delay between two rail channels",

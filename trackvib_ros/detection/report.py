@@ -210,9 +210,7 @@ def cut_off(records: Sequence[Record], passage: Passage) -> set[str]:
     return flags
 
 
-def _passing(
-    records: Sequence[Record], passage: Passage
-) -> Iterator[tuple[Record, float, float]]:
+def _passing(records: Sequence[Record], passage: Passage) -> Iterator[tuple[Record, float, float]]:
     """The rail channels that show a train, from when to when (s)."""
     start, stop = passage.interval
     for record in records:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, optimize
+from scipy.special import ndtr
 
 from .features import Window
 from .kinematics import MAX_ACCELERATION, PRIOR_ACCELERATION, Motion
@@ -43,9 +44,6 @@ _LEAST_GAIN = 25.0  # e^25 outweighs the 10^6 motions tried, and one error in 10
 _LEAST_CORRELATION = 0.5  # of the energies, which all trains show
 _CANDIDATES = 5  # speeds that are compared with all filters
 _SAME = 1.0  # m about a delay: beyond, another wheelset is taken for this one
-SURE = 0.995
-"""Least probability of a delay that nothing else confirms: a wrong one lies beyond any interval and
-may take a tenth of the 5 % that one of 95 % misses."""
 _CELLS, _WIDE = 6, 4.0  # either side of a mean, that hold a density; its standard deviations there
 _CLIP = 5.0  # rms, above which a sample of the waveform counts no more
 
@@ -63,7 +61,9 @@ class Travel:
             independent.
         correlation: of the waveforms below 100 Hz, of the energies.
         band: whose energies agree best.
-        sure: probability of this delay among those that differ.
+        doubt: standard uncertainty of the speed (m/s) by other delays, which equal cars make nearly
+            as likely.
+        sure: probability that the likeliest of these is worse.
     """
 
     motion: Motion
@@ -72,7 +72,8 @@ class Travel:
     lead: float
     correlation: tuple[float, float]
     band: int
-    sure: float
+    doubt: float = 0.0
+    sure: float = 1.0
 
     @property
     def clear(self) -> bool:
@@ -81,7 +82,6 @@ class Travel:
             self.gain > _LEAST_GAIN
             and self.lead > _LEAST_GAIN
             and self.correlation[1] > _LEAST_CORRELATION
-            and self.sure > SURE
         )
 
 
@@ -221,19 +221,31 @@ class _Candidate:
         return abs(self.delay - other.delay) > _SAME / min(self.speed, other.speed)
 
 
-def _together(pair: Pair, one: _Candidate, among: Sequence[_Candidate], duration: float) -> float:
-    """Gain of a delay under the filters of all candidates: only so do they see the same data."""
-    total = 0.0
+def _together(
+    pair: Pair, one: _Candidate, among: Sequence[_Candidate], duration: float
+) -> tuple[float, float]:
+    """Gain of a delay under the filters of all candidates, and its sampling variance: only so do
+    they see the same data. The filters pass data in common: together they tell their average.
+
+    The log-likelihood ratio of one sample of Gaussian variables with the correlation r has the
+    variance r².
+    """
+    gain, variance = 0.0, 0.0
     for other in among:
         length = duration * other.speed
         u = _axis(other.speed, length)
         edges = _time(pair, u, one.bend), _time(pair, u + one.delay, one.bend)
-        wave, *energies = (
-            float(_gain(_correlation(a, b), _samples(length, fine)))
-            for a, b, fine in _features(pair, edges, _COARSE_FINE)
-        )
-        total += wave + max(energies)
-    return total
+        rs, counts = np.array(
+            [
+                (max(_correlation(a, b), 0.0), _samples(length, fine))
+                for a, b, fine in _features(pair, edges, _COARSE_FINE)
+            ]
+        ).T
+        gains, variances = _gain(rs, counts), counts * rs**2
+        k = 1 + int(np.argmax(gains[1:]))
+        gain += float(gains[0] + gains[k])
+        variance += float(variances[0] + variances[k])
+    return gain / len(among), variance / len(among)
 
 
 def _lags(pair: Pair, speed: float, bend: float, length: float) -> _Lags:
@@ -310,13 +322,20 @@ def search(pair: Pair, limits: tuple[float, float]) -> Travel | None:
     if not found:
         return None
     found = sorted(found, key=lambda c: -c.gain)[:_CANDIDATES]
-    # the filters pass data in common: together they tell what they tell on average
-    gains = np.array([_together(pair, c, found, duration) for c in found]) / len(found)
+    gains, variances = np.array([_together(pair, c, found, duration) for c in found]).T
     k = int(np.argmax(gains))
-    # equal cars have delays that are as likely as the right one
-    others = [g for g, c in zip(gains, found, strict=True) if c.differs(found[k])]
-    sure = 1 / (1 + float(np.sum(np.exp(np.array(others) - gains[k]))))
-    return _refined(pair, found[k], sure)
+    told = _refined(pair, found[k])
+    # samples were taken for independent: what the best delay leaves tells how many are
+    share = told.gain / max(float(gains[k]), 1e-9)
+    doubt, sure = 0.0, 1.0
+    for one, gain, variance in zip(found, gains, variances, strict=True):
+        if one.differs(found[k]):
+            # by the sampling variance of what the gains differ by (Vuong, Econometrica 57, 1989)
+            spread = np.sqrt(max(variances[k] + variance, 1e-9) / share)
+            off = pair.baseline / abs(one.delay) - told.motion.speed
+            better = float(ndtr((gain - gains[k]) / spread))
+            doubt, sure = doubt + better * off**2, min(sure, 1 - better)
+    return replace(told, doubt=doubt**0.5, sure=sure)
 
 
 def _features_under(pair: Pair, motion: Motion, direction: int) -> list[tuple[Array, Array, float]]:
@@ -397,7 +416,7 @@ def _moments(cost: Callable[[float], float]) -> tuple[float, float]:
     return mean, spread
 
 
-def _refined(pair: Pair, one: _Candidate, sure: float) -> Travel:
+def _refined(pair: Pair, one: _Candidate) -> Travel:
     direction = 1 if one.delay > 0 else -1
     rough, band = pair.baseline / abs(one.delay), one.band
     epoch = 0.5 * (pair.within[0] + pair.within[1])
@@ -449,5 +468,4 @@ def _refined(pair: Pair, one: _Candidate, sure: float) -> Travel:
         one.lead,
         (wave, energy),
         band,
-        sure,
     )
