@@ -49,6 +49,9 @@ _SPEED_STEP = 0.004  # 0.4 m at the ends of a train of 200 m
 _COARSE_BEND, _FINE_BEND = 2.0, 0.5  # m
 _MOST_BENDS = 4  # to either side: two of the coarse ones
 _FINE_STEP, _FINE = 0.001, 12  # relative; steps to either side, three of the coarse ones
+# variance of a motion over that by Z: what blows leave is no white noise, and wheelsets are not
+# heard alike; mean square of error / sigma on 16 computed passages: speed 4.2, ends 2.1 and 1.1
+_DISPERSION = 2.5
 _RIVAL = 8.0  # ln of odds beyond which another type need not be looked at closely
 _CHANCE = 1e-3  # of a train that is none, all trials counted
 _LEAST_HEARD = 0.5  # of the time that the train takes
@@ -169,7 +172,8 @@ def _refined(
 ) -> _Found:
     """Mean and covariance of the motion of a type, by the likelihood of motions near a coarse one.
 
-    The prior of the acceleration is normal about 0, that of place and speed even.
+    It is a quasi-likelihood of a measured dispersion (R. Wedderburn, Biometrika 61, 1974, 439). The
+    prior of the acceleration is normal about 0, that of place and speed even.
     """
     places = train.oriented(reverse)
     speeds = speed * (1 + _FINE_STEP * np.arange(-_FINE, _FINE + 1))
@@ -193,7 +197,7 @@ def _refined(
     weight = np.exp(log - total)
     mean = weight @ state
     away = state - mean
-    covariance = (weight[:, None] * away).T @ away
+    covariance = _DISPERSION * (weight[:, None] * away).T @ away
     if not reach:
         covariance[2, 2] = PRIOR_ACCELERATION**2
     # the delay between channels whose places are in doubt has a share in the speed
