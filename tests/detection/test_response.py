@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 from trackvib_ros.detection import CONFIRMED, Catalogue, Channel, Estimate, TrainEvent, detect
 from trackvib_ros.detection.catalogue import TrainType
 from trackvib_ros.detection.events import Layer
+from trackvib_ros.detection.response import CONFIRM_EVIDENCE, ResponsePassage
 from trackvib_ros.detection.response_loads import loaded
-from trackvib_ros.detection.response_model import Model, Observation, Spectrum, comb, ringing
+from trackvib_ros.detection.response_model import (
+    Model,
+    Observation,
+    Spectrum,
+    comb,
+    late_by,
+    ringing,
+)
 from trackvib_ros.detection.response_search import CORRELATED, ResponseFit, Search
 from trackvib_ros.detection.unlisted import CAR, EqualCars, like
 from trackvib_ros.nuisances import RATE, nuisance
@@ -20,6 +28,7 @@ from trackvib_ros.nuisances import RATE, nuisance
 Array = NDArray[np.float64]
 
 SHIPPED = Catalogue.default()
+RAILCAR = TrainType("railcar", (0.0, 1.9, 15.625, 18.275, 32.0, 33.9), 2)
 BEFORE_S = 12.0  # s, noise to learn, then the first wheelset
 
 
@@ -165,6 +174,10 @@ def test_a_channel_alone_gives_the_speed_of_a_known_type(
     assert "axles_not_visible" in event.quality
     spectral = estimate(event, "speed_spectrum")
     assert abs(spectral.value - speed) < 4 * spectral.sigma
+    left = [event for event in events if event.kind == "departure"][-1]
+    late = left.stamp_ns * 1e-9 - times[-1]
+    # the mode at 6 Hz rings for 0.33 s, by which energies alone are late
+    assert abs(late) < 3 * left.sigma_s < 0.3
 
 
 def test_a_mode_that_rings_on_is_ended_by_its_filter() -> None:
@@ -179,6 +192,10 @@ def test_a_mode_that_rings_on_is_ended_by_its_filter() -> None:
     root = np.exp(pole / rate)
     # blocks of several samples shift no pole: rounding of a least-squares fit only
     np.testing.assert_allclose(taps, [1.0, -2 * root.real, abs(root) ** 2], atol=1e-6)
+    # energy decays as exp(-2 zeta omega t)
+    energy_late = 1 / (4 * np.pi * f * damping)
+    assert late_by(tuple(taps), 1 / rate, 5.0) == pytest.approx(energy_late, rel=1e-3)
+    assert late_by(tuple(taps), 1 / rate, 20.0) == 0.0
     left = np.convolve(x, taps)[: x.size]
     assert np.sum(np.abs(left) > 1e-4 * np.abs(left).max()) <= 3 * 2
 
@@ -296,16 +313,19 @@ def test_channels_share_the_speed_of_the_train_whenever_they_are_strong() -> Non
 def test_a_short_train_is_sought_on_waves_short_enough() -> None:
     """Two articulated cars, 36 m over the wheelsets, on a gauge near the track: on waves of 8 m
     there is nothing to compare."""
-    axles = np.array([0.0, 2.2, 17.0, 19.7, 34.0, 36.2])
-    train = TrainType("railcar", tuple(axles), 2)
-    times = BEFORE_S + axles / 25.0
+    times = BEFORE_S + RAILCAR.axles / 25.0
     t = np.arange(round((times[-1] + 4) * 200)) / 200
     x = np.sum(np.exp(-(((t[:, None] - times) * 25.0 / 1.5) ** 2)), axis=1)
     x += 0.05 * np.random.default_rng(1).standard_normal(t.size)
     search = Search([seen(x, 200.0, times, 12.7)], (5.0, 120.0))
-    found = search.refined(search.coarse(train, False))[0]
+    found = search.refined(search.coarse(RAILCAR, False))[0]
     # 0.2 m of 36 m, before anything finer is asked
     assert found.speed == pytest.approx(25.0, rel=5e-3)
+    assert found.evidence > CONFIRM_EVIDENCE
+    # a road vehicle and spikes have as much: three bogies are three blows
+    gauge = (Channel("gauge", 0.0, "bridge"),)
+    told = ResponsePassage((found,), (1.0,), gauge, (0.0, 0.1), 0, search.duration, None)
+    assert not told.confirmed
 
 
 @pytest.mark.parametrize(

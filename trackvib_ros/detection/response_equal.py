@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .kinematics import PRIOR_ACCELERATION
 from .response_search import FINE, KEPT, PASSED, PASSED_SPREAD, ResponseFit, Search, ranked
-from .unlisted import CAR, FEWEST, EqualCars, like, starts
+from .unlisted import CAR, EqualCars, like, starts
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ def _harmonics(fit: ResponseFit) -> list[ResponseFit]:
     assert fit.cars is not None
     found = []
     for factor in (0.5, 2.0):
-        number = max(FEWEST, round(fit.cars.cars * factor))
+        number = max(2, round(fit.cars.cars * factor))
         v, a = factor * fit.speed, factor * fit.acceleration
         found += [replace(fit.of(kind), speed=v, acceleration=a) for kind in fit.cars.kinds(number)]
     return found

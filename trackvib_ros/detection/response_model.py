@@ -56,6 +56,7 @@ class Observation:
         duration: between 5 and 95 % of the energy (s).
         limit: highest frequency it holds (Hz).
         filtered: coefficients by which ``values``, but not ``quiet``, were filtered.
+        rings: how late (s) the energy of free vibration is that was not filtered out.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Observation:
     duration: float
     limit: float
     filtered: tuple[float, ...] = (1.0,)
+    rings: float = 0.0
 
 
 class Spectrum:
@@ -273,13 +275,16 @@ class Model:
         series = np.exp(-2j * np.pi * np.outer(s.f, t + self.centre)) @ knots
         return np.asarray(self._shape(places.size, t.size) * series)
 
-    def centroids(self, combs: ComplexArray, wheelsets: int, centres: Array) -> tuple[Array, Array]:
+    def centroids(
+        self, combs: ComplexArray, wheelsets: int, centres: Array, signed: bool
+    ) -> tuple[Array, Array]:
         """Centroid of the square of the most probable response, after the epoch, and its width (s).
 
         Args:
             combs: :meth:`comb` of one motion.
             wheelsets: their number.
             centres: trial values of :attr:`centre`, shape (centres,).
+            signed: whether it may be negative, as an energy may not.
 
         Returns:
             Both of shape (centres,).
@@ -290,7 +295,7 @@ class Model:
         time = np.linspace(-self.before, self.after, _PLACES)
         waves = np.exp(2j * np.pi * np.outer(time, s.f)) * self._shape(wheelsets, t.size)
         series = np.real(waves @ (np.exp(-2j * np.pi * np.outer(s.f, t)) @ knots))
-        energy = np.maximum(series, 0) ** 2
+        energy = series**2 if signed else np.maximum(series, 0) ** 2
         energy /= np.maximum(energy.sum(axis=0), 1e-300)
         centroid = time @ energy
         width = np.sqrt(np.maximum(time**2 @ energy - centroid**2, 0.0))
@@ -403,25 +408,39 @@ def ringing(time: Array, values: Array, since: float) -> tuple[float, ...]:
     return tuple(float(tap) for tap in taps)
 
 
+def late_by(taps: Sequence[float], step: float, low: float) -> float:
+    """Centroid (s) of the energy of free vibration, ``1 / (2 zeta omega)``, above ``low`` (Hz).
+
+    Args:
+        taps: of :func:`ringing`, of samples ``step`` (s) apart.
+    """
+    poles = np.log(np.roots(taps).astype(complex)) / step
+    decays = -poles.real[np.abs(poles.imag) >= 2 * np.pi * low]
+    return float(np.max(0.5 / decays)) if decays.size else 0.0
+
+
 def observations(
     record: Record, within: tuple[float, float], extent: tuple[float, float]
 ) -> list[Observation]:
     """The low-passed waveform and the energy of every band, in this order."""
     window = record.window
     step = window.step
-    series = [("waveform", window.time - window.low_shift, window.low, _TOP_HZ)]
+    series = [("waveform", window.time - window.low_shift, window.low, _TOP_HZ, 0.0)]
+    modes: tuple[float, ...] = (1.0,)
     for b, band in enumerate(window.bands):
         name = f"energy {band[0]:g}-{band[1]:g} Hz"
-        series.append((name, window.time - window.shift[b], window.energy[:, b], 0.3 * band[1]))
+        energy = window.time - window.shift[b], window.energy[:, b]
+        series.append((name, *energy, 0.3 * band[1], band[0]))
     epoch = 0.5 * (extent[0] + extent[1])
     out = []
-    for name, time, raw, limit in series:
+    for name, time, raw, limit, low in series:
         values = raw
         if not window.valid.all() and window.valid.any():
             values = np.interp(time, time[window.valid], raw[window.valid])
         near = (time > extent[0] - _MARGIN_S) & (time < extent[1] + _MARGIN_S)
         quiet = values[window.time < within[0]]
         taps = ringing(time, values, extent[1]) if name == "waveform" else (1.0,)
+        modes = taps if name == "waveform" else modes
         time = time - epoch
         part = values[near]
         ends = max(4, round(0.1 / step))
@@ -437,5 +456,6 @@ def observations(
         quiet = quiet - quiet.mean() if quiet.size else quiet
         duration = extent[1] - extent[0]
         top = min(limit, 0.4 / step)
-        out.append(Observation(name, epoch, grid, part, quiet, duration, top, taps))
+        rings = late_by(modes, step, low) if name != "waveform" else 0.0
+        out.append(Observation(name, epoch, grid, part, quiet, duration, top, taps, rings))
     return out

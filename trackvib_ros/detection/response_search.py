@@ -44,7 +44,7 @@ _MIDDLE, FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
 _DECELERATION = 0.4  # of the speed, largest change over a passage
 _LARGEST = 1.0  # m/s²
-_PLACED = 0.45  # of its own width, distance of the centroid of a response from its wheelset
+_PLACED = 0.3  # of its own width, distance of the centroid of a response from its wheelset
 _WAVES = 16  # on a train, at least, at first: on fewer there is nothing to compare
 _NEIGHBOUR = 0.3  # cycles at the ends of a train between trial motions
 _PART = 6  # wheelsets, at least, whose amplitude is measured by itself
@@ -414,15 +414,28 @@ class Search:
                 found.append(best)
         return ranked(found)[:_PEAKS]
 
-    def passing(self, fit: ResponseFit, k: int, unit: float) -> tuple[float, float]:
-        """When the middle of the train passes the channel of observation ``k`` (s), sigma.
+    def passing(self, fit: ResponseFit, channel: int, unit: float) -> tuple[float, float]:
+        """When the middle of the train passes a channel (s), sigma.
 
-        A response begins before its wheelset and rings after it; computed passages have its
-        centroid within 0.45 of its own width of the wheelset (rms). Which support it has, and
-        where, is known as far as the evidence tells: mean and spread over all that are tried.
+        By waveform and energy of the channel; where they contradict each other, sigma is wider.
 
         Args:
             unit: difference of evidence that stands for a factor e.
+        """
+        both = [self._place(fit, k, unit) for k in (2 * channel, 2 * channel + 1)]
+        time, sigma = np.array(both).T
+        weight = sigma**-2 / np.sum(sigma**-2)
+        mean = float(weight @ time)
+        contradiction = float(np.sum(((time - mean) / sigma) ** 2))
+        return mean, float(np.sqrt(max(1.0, contradiction) / np.sum(sigma**-2)))
+
+    def _place(self, fit: ResponseFit, k: int, unit: float) -> tuple[float, float]:
+        """When the middle of the train passes by observation ``k`` (s), sigma.
+
+        A response begins before its wheelset and rings after it; computed passages have its
+        centroid within 0.3 of its own width of the wheelset (rms), but for free vibration. Which
+        support it has, and where, is known as far as the evidence tells: mean and spread over all
+        that are tried.
         """
         old = fit.models[k]
         top, step = float(old.spectrum.f[-1]), FINE / fit.speed
@@ -435,7 +448,7 @@ class Search:
             model = replace(old, spectrum=spectrum, before=before, after=before + ring)
             combs = fit.comb(model)
             values.append(model.evidence(combs, fit.places.size, centres)[0])
-            place, width = model.centroids(combs, fit.places.size, centres)
+            place, width = model.centroids(combs, fit.places.size, centres, k % 2 == 0)
             places.append(place)
             widths.append(width)
         value, place, width = (np.concatenate(each) for each in (values, places, widths))
@@ -443,7 +456,7 @@ class Search:
         weight /= weight.sum()
         mean = float(weight @ place)
         variance = float(weight @ ((place - mean) ** 2 + (_PLACED * width) ** 2))
-        return old.spectrum.epoch + mean, float(np.sqrt(variance))
+        return old.spectrum.epoch + mean, float(np.hypot(np.sqrt(variance), self.seen[k].rings))
 
     def refined(self, fits: Sequence[ResponseFit]) -> list[ResponseFit]:
         """The likely ones of coarse fits on finer and finer waves, most probable first."""

@@ -20,10 +20,7 @@ NUMBERS_APART = 3
 ALTERNATIVES = NUMBERS_APART * 8
 """With four distances of bogies and two wheelbases that it tells apart."""
 
-FEWEST = 3
-"""Cars of a train of equal cars: a response as long as two looks like them."""
-
-_NUMBERS = (FEWEST, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 23, 26, 30)
+_NUMBERS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 23, 26, 30)
 _CENTRES = (0.62, 0.72)  # over the length of a car, of those that a first look tells apart
 _SHARED = 1.0  # bogies shared by two cars
 _USUAL = 0.70, 0.04  # the same of cars in service: the shipped types have 0.65 to 0.76
@@ -110,7 +107,7 @@ class EqualCars:
 
     def numbers(self) -> list[EqualCars]:
         """The same cars, up to three more or fewer."""
-        near = range(max(FEWEST, self.cars - 3), self.cars + 4)
+        near = range(max(2, self.cars - 3), self.cars + 4)
         return [replace(self, cars=n) for n in near]
 
     def kinds(self, number: int) -> list[EqualCars]:
@@ -168,6 +165,6 @@ def like(train: TrainType) -> tuple[EqualCars, float] | None:
     length = float(np.median(two))
     centres = float(np.median(np.maximum(apart[1:], apart[:-1])))
     shared = centres > 0.9 * 0.5 * length and centres < 1.1 * 0.5 * length
-    span, car, ratio = (train.span, centres, _SHARED) if shared else (train.length, length, 0.0)
-    number = max(FEWEST, round(span / car))
-    return EqualCars(number, ratio or centres / length, base / car), car
+    if shared:
+        return EqualCars(max(2, round(train.span / centres)), _SHARED, base / centres), centres
+    return EqualCars(max(2, round(train.length / length)), centres / length, base / length), length
