@@ -1,12 +1,14 @@
 """Places of wheelsets from their deflection, against pulses whose place is known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import signal
 
 from trackvib_ros.detection import Catalogue
+from trackvib_ros.detection.blind import _bent
 from trackvib_ros.detection.kinematics import Motion
 from trackvib_ros.detection.place import Wave, agreement, classes, likelihood, locate, spectrum
 
@@ -248,3 +250,33 @@ def test_holes_are_filled_with_what_other_wheelsets_show():
         error, before = (float(np.sum(np.abs(x - true) ** 2)) for x in (seen, line))
         # waves beyond 2 pi m are not asked for and not filled: a third of the error is theirs
         assert error < 0.5 * before
+
+
+def test_the_acceleration_of_an_unlisted_train_is_how_its_way_between_channels_grows():
+    ratios, sigmas = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(6000 + seed)
+        speed, noise = rng.uniform(30.0, 60.0), 10.0 ** rng.uniform(-1.0, 0.5)
+        true = Motion(4.0, 0.0, speed, 0.3 * rng.standard_normal(), np.eye(3))
+        time = np.arange(0.0, 6.0 + AXLES[-1] / speed, 1 / RATE)
+        # wheelsets, by both channels, are placed to 2 cm only
+        places = AXLES + 0.02 * rng.standard_normal(AXLES.size)
+        pair = []
+        for x in (0.0, 20.0):
+            at = np.abs(true.distance_at(time)[:, None] - AXLES - x)
+            value = np.sum(np.exp(-at) * (np.cos(at) - np.sin(at)), axis=1)
+            value = value + noise * rng.standard_normal(time.size)
+            given = Wave(time, value, np.ones(time.size, dtype=bool))
+            pair.append(
+                SimpleNamespace(channel=SimpleNamespace(x=x), wave=lambda given=given: given)
+            )
+        # the delay as a whole tells the acceleration to 0.05 m/s², and the speed of the middle
+        middle = true.moved(float(true.time_at(0.5 * AXLES[-1] + 10.0)))
+        thought = replace(middle, acceleration=true.acceleration + 0.05 * rng.standard_normal())
+        known = thought.distance_at(true.time_at(places))
+        found = _bent(*pair, thought, 1, known)
+        ratios.append((found.acceleration - true.acceleration) / found.acceleration_sigma)
+        sigmas.append(found.acceleration_sigma)
+    # 20 draws: the rms of unit normals lies within 1 +- 3 / sqrt(40)
+    assert 0.52 < np.sqrt(np.mean(np.square(ratios))) < 1.48
+    assert np.median(sigmas) < 0.1

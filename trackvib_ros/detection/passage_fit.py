@@ -23,6 +23,7 @@ CERTAIN = 0.99
 """Probability of a type, by its pattern alone, that teaches where the channels are."""
 
 _HOPELESS = 0.25  # of score, behind the best type
+_HARDLY = 1e-12  # probability, below one in a million if places were free: moved ones are weighed
 _TWIN = 0.1  # m, places of two types that differ by no more but their size have the same times
 _UNSTATED = 5.0  # m, distance between channels of no use
 
@@ -95,7 +96,10 @@ def fit_hypotheses(
     )
     if hypotheses and direction:
         last = int(np.argmax(np.abs(stated)))
-        measured = _measure(candidates, names, direction * stated, direction)
+        share = np.zeros(len(candidates))
+        np.add.at(share, [e.candidate for e in explanations], [e.probability for e in explanations])
+        asked = [c for c, p in zip(candidates, share, strict=True) if p > _HARDLY]
+        measured = _measure(asked, names, direction * stated, direction)
         passage = replace(
             passage,
             delay=delay_speed(passage) if moved is None else None,

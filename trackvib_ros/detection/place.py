@@ -252,6 +252,7 @@ class _Group:
         course: waveform of the channel.
         part: of its wavenumbers.
         at: places of the wheelsets (m).
+        bend: of these places, by the change of the motion and by the effects of classes.
         seen: transform of the waveform there.
         log: likelihood of the pulse against noise.
         pulses: what is expected of the pulses there.
@@ -260,18 +261,13 @@ class _Group:
     course: _Course
     part: slice
     at: Array
+    bend: Array
     seen: Any
     log: float = 0.0
 
     def __post_init__(self) -> None:
         k = self.course.k[self.part]
         self._first, self._step = float(k[0]), float(k[1] - k[0])
-        alike = classes(self.at)
-        member = np.arange(int(alike.max()) + 1)[:, None] == alike
-        along = 2 * (self.at - self.at[0]) / (self.at[-1] - self.at[0]) - 1
-        # what all wheelsets have in common is in the pulse
-        own = _CLASS_SIGMA * (member - member.mean(axis=1, keepdims=True))
-        self._bend = np.stack([np.ones_like(along), along, 0.5 * along**2, *own])
         bands = max(1, round(k.size * self._step / _BAND))
         self._band = np.arange(k.size) * bands // k.size
         self._share = _independent(self.course) / self.course.k.size
@@ -283,32 +279,34 @@ class _Group:
 
         The pulse that fits best sets the weights and the likelihood.
         """
-        ahead = self.at - self.at[0] + change @ self._bend[1:3]
+        ahead = self.at - self.at[0] + change @ self.bend[1:3]
         k, phases = _phases(self._first, self._step, self.seen.size, ahead)
-        comb, *slopes = self._bend @ phases
+        comb, slopes = np.split(self.bend @ phases, [1])
         pulse = np.exp(-1j * np.outer(_PULSE, k))
         taps = pulse * comb
-        free = np.concatenate([taps, 1j * taps])
-        _, shape, _ = self._reduced(free, free[:0], self.seen[None])
-        alone = np.concatenate([pulse, 1j * pulse])
-        slopes = (shape[0] @ alone) * -1j * k * np.array(slopes)
-        rows = np.concatenate([self.seen[None], slopes[:2]])
-        left, _, _ = self._reduced(free, slopes[2:], rows)
-        level, self._weight = self._noise(left[0])
-        left, shape, doubt = self._reduced(free, slopes[2:], rows)
-        own = shape[:, len(free) :]
-        # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
-        cost = _PULSE.size * float(np.log(2 * self._share * k.size))
-        self.log = level - self._alone - cost - 0.5 * (float(own[0] @ own[0]) + doubt)
+        left, shape = self._reduced(taps, self.seen[None])
         begun = bool(np.any(self.pulses))
-        pulses = shape[0] @ np.concatenate([free, slopes[2:]])
-        self.pulses = pulses / (1.0 if begun else self.course.measured)
+        if not (begun and self.course.whole):
+            _, self._weight = self._noise(left[0])
+        turned = (shape[0] @ pulse) * -1j * k
+        left, _ = self._reduced(taps, np.concatenate([self.seen[None], turned * slopes]))
+        rows, own = left[:3], left[3:]
+        weighted = own.conj() * self._weight
+        known = np.real(weighted @ own.T) + np.eye(len(own))
+        effects = np.linalg.solve(known, np.real(weighted @ rows.T)).T
+        rows = rows - effects @ own
         # the second derivative of the likelihood: the weight less by how it falls with the rest
         bent = self._weight * (
-            1 - self._weight * np.abs(left[0]) ** 2 / (2 * self._share * (_LINES + 1))
+            1 - self._weight * np.abs(rows[0]) ** 2 / (2 * self._share * (_LINES + 1))
         )
-        normal = np.real((left[1:] * bent).conj() @ left[1:].T) + own[1:] @ own[1:].T
-        right = np.real((left[1:] * self._weight).conj() @ left[0]) + own[1:] @ own[0]
+        normal = np.real((rows[1:] * bent).conj() @ rows[1:].T) + effects[1:] @ effects[1:].T
+        right = np.real((rows[1:] * self._weight).conj() @ rows[0]) + effects[1:] @ effects[0]
+        level, self._weight = self._noise(rows[0])
+        # what a free pulse costs (Schwarz, Annals of Statistics 6, 1978): noise has none
+        cost = _PULSE.size * float(np.log(2 * self._share * k.size))
+        doubt = float(effects[0] @ effects[0] + np.linalg.slogdet(known)[1])
+        self.log = level - self._alone - cost - 0.5 * doubt
+        self.pulses = (self.seen - rows[0]) / (1.0 if begun else self.course.measured)
         return normal, right
 
     def _noise(self, rest: Any) -> tuple[float, Array]:
@@ -330,18 +328,23 @@ class _Group:
         weight = 2 * self._share * (_LINES + 1) / (_LINES * own + power)
         return self._share * float(log.sum()), weight
 
-    def _reduced(self, free: Any, own: Any, rows: Any) -> tuple[Any, Any, float]:
-        """Rows less what pulses and effects of variance one explain, what of these, and twice what
-        the effects take of the likelihood (ln) by being in doubt."""
-        design = np.concatenate([free, own])
-        weighted = design.conj() * self._weight
-        normal = np.real(weighted @ design.T)
-        pulses = normal[: len(free), : len(free)]
-        pulses += 1e-9 * np.trace(pulses) * np.eye(len(free))
-        normal[len(free) :, len(free) :] += np.eye(len(own))
-        shape = np.linalg.solve(normal, np.real(weighted @ rows.T)).T
-        doubt = float(np.linalg.slogdet(normal)[1] - np.linalg.slogdet(pulses)[1])
-        return rows - shape @ design, shape, doubt
+    def _reduced(self, taps: Any, rows: Any) -> tuple[Any, Any]:
+        """Rows less what of them pulses explain, and these pulses."""
+        weighted = taps.conj() * self._weight
+        normal = weighted @ taps.T
+        normal += 1e-9 * np.trace(normal).real * np.eye(len(taps))
+        shape = np.linalg.solve(normal, weighted @ rows.T).T
+        return rows - shape @ taps, shape
+
+
+def _bends(places: Array) -> Array:
+    """How places move: all alike, with the change of the motion, by effects of variance one."""
+    along = 2 * (places - places[0]) / (places[-1] - places[0]) - 1
+    alike = classes(places)
+    member = np.arange(int(alike.max()) + 1)[:, None] == alike
+    # what all wheelsets have in common is in the pulse
+    own = _CLASS_SIGMA * (member - member.mean(axis=1, keepdims=True))
+    return np.stack([np.ones_like(along), along, 0.5 * along**2, *own])
 
 
 def classes(places: Array) -> NDArray[np.int64]:
@@ -390,6 +393,7 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
         course = _course(wave, motion, at, _GROUPS[-1][1], _FINE_STEP)
         if course is not None:
             courses.append((course, at))
+    bends = [_bends(at) for _, at in courses]
     model = [np.zeros(course.k.size, dtype=np.complex128) for course, _ in courses]
     seen = [course.seen() for course, _ in courses]
     if not courses:
@@ -406,7 +410,7 @@ def agreement(waves: Sequence[Wave], motion: Motion, places: Sequence[Array]) ->
         for i, (course, at) in enumerate(courses):
             part = slice(*(int(j) for j in np.searchsorted(course.k, [low, high])))
             if (part.stop - part.start) * (course.k[1] - course.k[0]) > 0.5 * (high - low):
-                stage.append((i, _Group(course, part, at, seen[i][part])))
+                stage.append((i, _Group(course, part, at, bends[i], seen[i][part])))
         before = normal, right
         whole = all(group.course.whole for _, group in stage)
         for _ in range((_ROUNDS if whole else _COMPLETIONS) if stage else 0):
