@@ -39,7 +39,7 @@ _BOGIE = 2  # wheelsets
 _PULSE_SIGMA_S = 0.0004  # energy is measured in bins of about 1 ms
 _SHOWN = 0.9  # of the two metres about a wheelset, to be measured
 _SHAPE = 0.012  # m, of wheelsets against each other, by the shape of their pulse: computed at 40 dB
-_GROWTH = 0.0013  # m, of a deflection's place from the middle of a train to its end: rms at 40 dB
+_GROWTH = 0.0009  # m, of a deflection's place from the middle of a train to its end: rms at 40 dB
 _BENDS = 4  # most corrections of the acceleration, until one is less than its sigma
 _PLACE = 0.15  # m, of all pulses against their wheelsets, before their deflection is added
 
@@ -344,7 +344,8 @@ def _bent(a: Record, b: Record, motion: Motion, direction: int, places: Array) -
         rate = -2 * found.speed**2 / (way * float(at[-1] - at[0]))
         grown = first.covariance[0, 0] + second.covariance[0, 0] + 2 * _GROWTH**2
         sigma = abs(rate) * float(grown) ** 0.5
-        if sigma >= motion.acceleration_sigma:
+        # of the delay as a whole, twice the errors are stated
+        if sigma > 0.5 * motion.acceleration_sigma:
             return motion
         more = rate * float(second.change[0] - first.change[0])
         found = replace(found, acceleration=found.acceleration + more)
