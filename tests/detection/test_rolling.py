@@ -17,7 +17,7 @@ def told(lengths, locomotive=0.0, draws=4):
     rng = np.random.default_rng(0)
     for _ in range(draws):
         base, longer, shorter = (lengths + 0.042 * rng.standard_normal(3)) / SPEED
-        stand = Bogies(base, 1.0, 0.0, (longer, shorter), locomotive / SPEED)
+        stand = Bogies(base, 1.0, centres=(longer, shorter), locomotive=locomotive / SPEED)
         bowl = SPEED * np.exp(DEFLECTION * rng.standard_normal())
         speed, sigma, _ = _posterior(bowl, stand, (bowl, DEFLECTION), LIMITS)
         yield speed / SPEED - 1, sigma / speed

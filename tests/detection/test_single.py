@@ -10,9 +10,9 @@ from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
 from trackvib_ros.detection.blind import Blind
 from trackvib_ros.detection.bowl import _LOADS, _STRENGTHS, _odds, corner, low_pass
-from trackvib_ros.detection.kinematics import Motion
+from trackvib_ros.detection.kinematics import PRIOR_ACCELERATION, Motion
 from trackvib_ros.detection.place import Wave
-from trackvib_ros.detection.single import Shown, _likeliest, _Trial, bogies
+from trackvib_ros.detection.single import Shown, _likeliest, _Trial, accelerated, bogies
 from trackvib_ros.detection.wheelsets import Wheelsets
 
 STEP = 0.001
@@ -108,6 +108,13 @@ def test_wheelsets_elsewhere_contradict_a_type():
     for k in (0, 8, PLACES.size - 2):
         fewer = replace(blind, times=np.delete(blind.times, [k, k + 1]))
         assert not fewer.contradicts(PLACES, motion, wave)
+    # cars whose bogies stand in another ratio are another type's, though no wheelset is 0.6 m off
+    coaches = replace(blind, cars=bogies(blind.times).ratio)
+    assert coaches.cars == pytest.approx(17.5 / 7.5)
+    assert not coaches.contradicts(PLACES, motion, wave)
+    longer = PLACES + np.tile([0.0, 0.0, 0.5, 0.5], 6)
+    assert coaches.contradicts(longer, motion, wave)
+    assert not blind.contradicts(longer, motion, wave)
     # not one of the type's was seen: they are there, or not
     one = replace(blind, times=blind.times[:1])
     assert not one.contradicts(PLACES[2:6], motion, wave)
@@ -120,6 +127,15 @@ def test_bogies_are_seen_whatever_the_speed(speed):
     assert stand.clear and stand.share == 1.0
     assert stand.base == pytest.approx(2.5 / speed)
     assert stand.speeds()[0] == pytest.approx(speed)
+    assert stand.cars and stand.regular == 1.0
+    # one chance pulse moves no wheelbase: that which repeats most is taken
+    chance = bogies(np.sort(np.append(PLACES, PLACES[4] - 2.2)) / speed)
+    assert chance.base == pytest.approx(2.5 / speed, rel=0.01)
+    threes = bogies((np.array([0.0, 1.4, 2.8]) + 16.0 * np.arange(5)[:, None]).ravel() / speed)
+    assert (stand.each, threes.each) == (2.0, 3.0)
+    # blows of a hammer that ring on
+    rung = bogies((np.array([0.0, 0.02]) + 0.7 * np.arange(12)[:, None]).ravel())
+    assert not rung.clear and not rung.cars
     even = bogies(np.arange(24) / speed)  # what is evenly spaced has none
     assert not even.clear
 
@@ -160,3 +176,25 @@ def test_short_waves_at_every_wheelset_are_no_faster_train():
     # in its own waves the faster train explains more than the slower one in those that it has
     assert fast.worth(shown, fast.likely) > slow.worth(shown, slow.likely)
     assert _likeliest(shown, [fast, slow])[0] is slow
+
+
+@pytest.mark.parametrize("wheelsets", [10, 24])
+def test_cars_of_one_kind_tell_the_acceleration(wheelsets):
+    """Jacobs bogies 16 m apart, or coaches; times scatter by 3 cm."""
+    articulated = (np.array([0.0, 2.7]) + 16.0 * np.arange(5)[:, None]).ravel()
+    places = {10: articulated, 24: PLACES}[wheelsets]
+    rng = np.random.default_rng(6)
+    ratios, sigmas = [], []
+    for _ in range(100):
+        speed = rng.uniform(25, 80)
+        motion = Motion(0.0, 0.0, speed, 0.6 * rng.standard_normal(), np.zeros((3, 3)))
+        times = motion.time_at(places + 0.03 * rng.standard_normal(wheelsets))
+        middle = motion.speed_at(0.5 * (times[0] + times[-1]))
+        rate, sigma = accelerated(times, 0.03 / middle, bogies(times), middle)
+        ratios.append((rate - motion.acceleration) / sigma)
+        sigmas.append(sigma)
+    # the rms of 100 ratios has a standard deviation of 0.07
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2
+    assert np.median(sigmas) < (0.03 if wheelsets > 10 else 0.3)
+    # what has no cars tells nothing
+    assert accelerated(times[:6], 1e-3, bogies(times[:6]), middle) == (0.0, PRIOR_ACCELERATION)

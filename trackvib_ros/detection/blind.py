@@ -14,7 +14,7 @@ from .calibration import Calibration
 from .kinematics import Motion
 from .place import STIFFNESS, Wave, agreement, likelihood, locate
 from .record import Record
-from .single import HUMP, HUMP_FINE, Shown, alone, log_energy
+from .single import HUMP, HUMP_FINE, SAME_GAP, Shown, alone, bogies, log_energy
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -58,11 +58,13 @@ class Blind:
         direction: +1, -1, or 0 unknown.
         correlation: of the energies of two channels; 0 with one channel.
         travels: whether this is a train: two channels show the same wheelsets one after the other,
-            or one shows bogies of one wheelbase.
+            or one shows bogies of one wheelbase, or cars of one kind.
         method: how the speed was obtained.
         axle_method: how the wheelsets were.
         spacing_sigma: of the distance between successive wheelsets (m), the speed apart.
         interval: of 95 % of the speed at mid-train (m/s), if it is not symmetric.
+        cars: the longer over the shorter distance of successive bogies if one channel shows cars
+            of one kind; 0 otherwise. That tells more of a train than the nearest type's pattern.
         sensors: channels used, the reference first.
         x: position of the reference (m).
         baseline: stated distance of the second channel from the reference (m).
@@ -83,6 +85,7 @@ class Blind:
     spacing_sigma: float = 0.3
     baseline: float = np.inf
     interval: tuple[float, float] | None = None
+    cars: float = 0.0
 
     @property
     def spacings(self) -> Array:
@@ -90,21 +93,24 @@ class Blind:
         return np.asarray(np.diff(self.motion.distance_at(self.times)))
 
     def contradicts(self, places: Array, motion: Motion, wave: Wave) -> bool:
-        """Whether a bogie or more of this train is not where a type has one.
+        """Whether a bogie or more of this train is not where a type has one, or it has other cars.
 
-        The deflection must show this train. Of wheelsets that only one of the two has, those of
-        this train must explain more of the deflection than their places and loads cost (two
-        unknowns each, Bayesian information), or those of the type less than their loads do: else
-        they were missed, or found by chance. What a hole of the record hides is not missing, and a
-        deflection that clipping cut off tells neither.
+        This must be a train without the type, and the deflection must show it. Of wheelsets that
+        only one of the two has, those of this train must explain more of the deflection than their
+        places and loads cost (two unknowns each, Bayesian information), or those of the type less
+        than their loads do: else they were missed, or found by chance. What a hole of the record
+        hides is not missing, and a deflection that clipping cut off tells neither.
 
         Args:
             places: of the type's wheelsets, in order (m).
             motion: of the type past the reference point.
             wave: low-passed waveform of the channel.
         """
-        if wave.clipped:
+        if wave.clipped or not (self.travels or self.cars):
             return False
+        other = bogies(places)
+        if self.cars and other.cars and abs(np.log(self.cars / other.ratio)) > SAME_GAP:
+            return True
         every = motion.distance_at(self.times)
         apart = np.abs(every[:, None] - places[None, :])
         own = every[apart.min(axis=1) > _ELSEWHERE]
@@ -377,7 +383,10 @@ def describe_alone(shown: Shown) -> Blind | None:
     gaps = np.diff(places)
     paired = np.append(gaps < _PARTNER, False) | np.append(False, gaps < _PARTNER)
     deflected = found.corner is not None
-    whole = deflected and paired.mean() > _PAIRED
+    # what clipping leaves of a deflection has another width
+    seen = deflected and not shown.wave.clipped and found.times.size >= 2 * _LEAST_WHEELSETS
+    # three wheelsets in every bogie are rather two, and what rings on
+    whole = deflected and paired.mean() > _PAIRED and found.bogies.each <= _BOGIE
     blind = Blind(
         sensors=(shown.record.channel.name,),
         x=shown.record.channel.x,
@@ -388,13 +397,10 @@ def describe_alone(shown: Shown) -> Blind | None:
         regular=found.certainty if whole else min(found.certainty, 0.5),
         direction=0,
         correlation=0.0,
-        # what clipping leaves of a deflection has another width
-        travels=found.corner is not None
-        and not shown.wave.clipped
+        travels=seen
         and found.worth > _LEAST_WORTH
-        and found.certainty > _LIKELY
-        and found.bogies.clear
-        and found.times.size >= 2 * _LEAST_WHEELSETS,
+        and (found.bogies.cars or (found.bogies.clear and found.certainty > _LIKELY)),
+        cars=found.bogies.ratio if seen and found.worth > 0 and found.bogies.cars else 0.0,
         method=found.method,
         axle_method="deflection of the rail" if deflected else "energy peak",
         interval=span,

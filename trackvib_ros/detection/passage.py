@@ -62,7 +62,10 @@ blows of a hammer in the right places have the correlation of a railcar on three
 # of the rise (ln) of all wheelsets, least one of those of two cars at either end: about 0 where no
 # train is, nine tenths and more where one is, down to 0 dB
 _ENDS = 1 / 3
-_WEAKER = 1e-3  # of trains, all of whose wheelsets are alike, have ends that rank so low
+_WEAKER = 1e-3
+"""Part of trains, all of whose wheelsets are alike, of which an end ranks so low: with two ends one
+right name in 500 is refused, as rarely as noise passed for the end of a longer type (1 in 540
+computed passages, p 7e-5). Of 216 right names the lowest had 1.4e-3, uniform as it should be."""
 
 
 @dataclass(frozen=True)

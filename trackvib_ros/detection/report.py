@@ -238,7 +238,7 @@ def _overlapped(passage: Passage) -> bool:
 
 def _prefer_blind(passage: Passage, blind: Blind) -> bool:
     """Whether pulses tell more of an unknown train than the nearest pattern of the catalogue."""
-    if blind.travels:
+    if blind.travels or blind.cars:
         return True
     if not passage.hypotheses or passage.score < KNOWN_SCORE:
         return blind.direction != 0 or passage.score < CONFIRM_SCORE or blind.regular >= 0.9

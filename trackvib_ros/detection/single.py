@@ -51,6 +51,10 @@ WHEELBASES = ((0.7, 2.5), (0.3, 1.82))
 PLACE_SIGMA = 0.03
 """Standard deviation of the place of a wheelset's bowl (m), roughness apart from noise."""
 
+_MERGED = 0.35
+"""The same by energies (m): those of a bogie's two wheelsets run into one another, which moves both
+towards its middle, by 0.2 to 0.35 m with wheelbases of 2.7 m (computed passages at 10 dB)."""
+
 _BOWL_SIGMA = 0.012
 """The same where place and load were found together (m): what wheelsets with other neighbours
 differ by (:mod:`evidence`)."""
@@ -58,20 +62,24 @@ differ by (:mod:`evidence`)."""
 HUMP, HUMP_FINE = 0.5, 0.2
 """Of the log-energy at a wheelset (m), and its smoothing."""
 
+SAME_GAP = 0.06
+"""Of a gap or its ln, between bogies of one build, or cars of one kind."""
+
 _SPEEDS = 60  # of the grid on which the spectrum of the deflection is looked at
 _TRIALS = 6  # speeds at which wheelsets are looked for
 _APART = 1.2  # ratio of different trials
 _LEVELS = (0.3, 0.5, 0.7, 1.0)
 _ROUGHNESS = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # of the bowl's highest density
-_SAME_GAP = 0.06  # of a wheelbase, between bogies of one build
 _BOGIE = 1.4  # wheelbases, beyond which the next wheelset is of another bogie
-_BASES = (1.5, 3.6)  # m, wheelbases that exist, by a bowl that is good to a fifth
+_BESIDE = 10.0  # wheelbases, to the nearer bogie beside: a hammer is not as quick as it rings on
+_BASES = (1.4, 3.6)  # m, wheelbases that exist, 1.75 to 3, by a bowl that is good to a fifth
 _LEAST_REPEATS = 3  # of two distances of bogies, that are chance or two ends else
+_LEAST_CARS = 5  # such repeats; of gaps at random six in a thousand are alike in both
+_MOST = 0.5  # of a train
 _LEAST_BOGIES = 5  # double blows of a hammer may make four
 _EVEN = 0.15  # of the wheelbase, robust scatter about it; of gaps of any length it is half
 _LEAST_WHEELSETS = 4
 _LEAST_QUIET = 100  # samples that tell the noise
-_ENERGETIC = 1  # speeds at which energies are looked at
 _LONGEST = 800.0  # m of train
 _SURE = 0.9  # probability of a number of wheelsets ...
 _ALL = 0.95  # ... and part of what is no noise that they explain, at which no other trial is needed
@@ -79,6 +87,8 @@ _PAIRED = 0.7
 _AGREE = 1.15  # of speeds that need not both be tried
 _SETTLED = 1.25  # of a trial against its wheelbase, of the pulses it was looked at with
 _MOST_TRIALS = 12
+_LIKE = 4  # residuals
+_BEYOND_DOUBT = 25.0  # ln of odds, as for two channels
 _GRID = np.linspace(-0.6, 0.6, 1201)  # ln of speed over the first guess
 
 
@@ -90,16 +100,30 @@ class Bogies:
         base: the wheelbase (s); 0 without bogies.
         share: of the wheelsets that stand in them.
         scatter: of the gaps in bogies about it (s), robust standard deviation.
+        each: wheelsets of most of them.
         centres: from bogie to bogie (s), the longer and the shorter of two successive distances
             that repeat most; ``None`` if none do.
+        regular: part of all such distances that are those, if they are enough to be no chance.
         locomotive: gap of pairs of wheelsets that stand further apart (s); 0 without any.
     """
 
     base: float = 0.0
     share: float = 0.0
     scatter: float = 0.0
+    each: float = 2.0
     centres: tuple[float, float] | None = None
+    regular: float = 0.0
     locomotive: float = 0.0
+
+    @property
+    def cars(self) -> bool:
+        """Whether most of them are those of cars of one kind, five and more in all."""
+        return self.share > _PAIRED and self.regular > _MOST
+
+    @property
+    def ratio(self) -> float:
+        """The longer over the shorter distance from bogie to bogie; 0 if none repeat."""
+        return 0.0 if self.centres is None else self.centres[0] / self.centres[1]
 
     @property
     def clear(self) -> bool:
@@ -284,20 +308,24 @@ def _likeliest(shown: Shown, trials: Sequence[_Trial]) -> tuple[_Trial, float]:
         own = [trial.worth(shown, slowest) for trial in trials]
 
     def rank(k: int) -> tuple[int, float]:
-        # wheelsets in bogies, whose number is likely, before others
-        return 2 * trials[k].bogies.clear + (trials[k].found.certainty > 0.5), own[k]
+        # wheelsets in bogies that the deflection shows, whose number is likely or that are those of
+        # cars of one kind, before others
+        stand = trials[k].bogies
+        sure = trials[k].found.certainty > 0.5 or stand.cars
+        return 2 * (stand.clear and alone[k] > 0) + sure, own[k]
 
     best = max(range(len(trials)), key=rank)
     return trials[best], alone[best]
 
 
 def _deflected(shown: Shown, speeds: Sequence[float]) -> tuple[list[_Trial], bool]:
-    """Wheelsets by the bowls of the deflection; whether the last of them are beyond doubt.
+    """Wheelsets by the bowls of the deflection; whether these show a train beyond doubt.
 
     What is found at one speed tells the next: by its bowl, and by the wheelbase of its bogies.
     """
     out: list[_Trial] = []
     tried: list[float] = []
+    seen = False
     queue = list(speeds)
     while queue and len(tried) < _MOST_TRIALS:
         speed = queue.pop(0)
@@ -312,11 +340,13 @@ def _deflected(shown: Shown, speeds: Sequence[float]) -> tuple[list[_Trial], boo
         good = trial.found.certainty > _SURE and trial.found.explained > _ALL * possible
         settled = any(abs(np.log(speed / v)) < np.log(_SETTLED) for v in trial.bogies.speeds())
         fine = explained(shown, trial.times, trial.likely, trial.likely)
-        if good and settled and fine is not None and fine.worth(placed=True) > 0:
+        worth = -np.inf if fine is None else fine.worth(placed=True)
+        if good and settled and worth > 0:
             return out, True
+        seen |= trial.bogies.clear and trial.bogies.cars and worth > _BEYOND_DOUBT
         by_bowl = [] if fine is None else [fine.value / shown.bowl[0]]
         queue = trial.bogies.speeds() + by_bowl + queue
-    return out, False
+    return out, seen
 
 
 def _pulses(shown: Shown, speed: float) -> tuple[_Trial | None, float]:
@@ -339,14 +369,16 @@ def _pulses(shown: Shown, speed: float) -> tuple[_Trial | None, float]:
 
 
 def _energetic(shown: Shown, speeds: Sequence[float]) -> list[_Trial]:
-    """Wheelsets in the log-energies of a band."""
+    """Wheelsets in the log-energies of a band, at all speeds but if one shows cars beyond doubt."""
     lag = np.arange(-60, 61) * travel.CELL
     hump = travel.band_pass(np.exp(-0.5 * (lag / HUMP) ** 2), HUMP_FINE, travel.BROAD)
     record, within = shown.record, shown.within
     before = (float(record.window.time[0]), within[0])
     trace, calm = record.traces(within)[shown.band], record.traces(before)[shown.band]
     out: list[_Trial] = []
-    for speed in speeds:
+    for k, speed in enumerate(speeds):
+        if any(abs(np.log(speed / v)) < np.log(_AGREE) for v in speeds[:k]):
+            continue
         edges, quiet = shown.axis(speed), np.arange(*before, travel.CELL / speed)
         cells = travel.band_pass(log_energy(trace, edges), HUMP_FINE, travel.BROAD)
         noise = None
@@ -356,6 +388,8 @@ def _energetic(shown: Shown, speeds: Sequence[float]) -> list[_Trial]:
         if found is not None and found.place.size >= _LEAST_WHEELSETS:
             times = edges[0] + (found.place + 0.5 * travel.CELL) / speed
             out.append(_Trial(speed, found, times, False, bogies(times)))
+            if out[-1].bogies.cars and found.certainty > _SURE:
+                break
     return out
 
 
@@ -367,21 +401,25 @@ def log_energy(trace: Trace, edges: Array) -> Array:
 def bogies(times: Array) -> Bogies:
     """The bogies of wheelsets (s), whatever their speed: two or three at one gap, others further.
 
-    Of all gaps that repeat, the one that leaves the fewest wheelsets alone or in longer rows.
+    Of all gaps that repeat, the one that leaves the fewest wheelsets alone or in longer rows, and
+    of these that which repeats most.
     """
     gaps = np.diff(times)
-    near = np.abs(np.log(gaps[:, None] / gaps[None, :])) < _SAME_GAP
+    near = np.abs(np.log(gaps[:, None] / gaps[None, :])) < SAME_GAP
     best = Bogies()
-    for k in np.argsort(gaps):
+    for k in np.argsort(-near.sum(axis=1), kind="stable"):
         base = float(np.median(gaps[near[k]]))
         # what rings on has more than three, and never ends
         ends = 1 + np.flatnonzero(gaps > _BOGIE * base)
-        sizes = [group.size for group in np.split(times, ends) if group.size in (2, 3)]
+        apart = np.concatenate([[np.inf], gaps[ends - 1], [np.inf]])
+        beside = np.minimum(apart[:-1], apart[1:]) < _BESIDE * base
+        groups = [g for g, near_one in zip(np.split(times, ends), beside, strict=True) if near_one]
+        sizes = [group.size for group in groups if group.size in (2, 3)]
         share = sum(sizes) / times.size if len(sizes) >= _LEAST_BOGIES else 0.0
         if share > best.share:
-            inner = np.concatenate([np.diff(g) for g in np.split(times, ends) if g.size in (2, 3)])
+            inner = np.concatenate([np.diff(g) for g in groups if g.size in (2, 3)])
             scatter = 1.4826 * float(np.median(np.abs(inner - base)))
-            best = Bogies(base, share, scatter)
+            best = Bogies(base, share, scatter, float(np.median(sizes)))
     return replace(best, **_between(times, best.base)) if best.base else best
 
 
@@ -391,16 +429,21 @@ def _between(times: Array, base: float) -> dict[str, Any]:
     groups = np.split(times, 1 + np.flatnonzero(gaps > _BOGIE * base))
     ways = np.diff([group.mean() for group in groups if group.size in (2, 3)])
     two = np.sort(np.stack([ways[1:], ways[:-1]], axis=1), axis=1)[:, ::-1]
-    centres = None
+    out: dict[str, Any] = {}
     if len(two):
-        near = np.all(np.abs(np.log(two[:, None] / two)) < _SAME_GAP, axis=2)
+        near = np.all(np.abs(np.log(two[:, None] / two)) < SAME_GAP, axis=2)
         most = int(np.argmax(near.sum(axis=1)))
-        if near[most].sum() >= _LEAST_REPEATS:
+        repeats = int(near[most].sum())
+        if repeats >= _LEAST_REPEATS:
             longer, shorter = np.median(two[near[most]], axis=0)
-            centres = (float(longer), float(shorter))
+            out["centres"] = (float(longer), float(shorter))
+        if repeats >= _LEAST_CARS:
+            out["regular"] = repeats / len(two)
     beside = np.concatenate([[np.inf], gaps, [np.inf]])
     pair = (gaps > _BOGIE * base) & (2 * gaps < np.minimum(beside[:-2], beside[2:]))
-    return {"centres": centres, "locomotive": float(np.median(gaps[pair])) if pair.any() else 0.0}
+    if pair.any():
+        out["locomotive"] = float(np.median(gaps[pair]))
+    return out
 
 
 def _posterior(
@@ -408,6 +451,7 @@ def _posterior(
     stand: Bogies,
     bowl: tuple[float, float] | None,
     limits: tuple[float, float],
+    rough: float = PLACE_SIGMA,
 ) -> tuple[float, float, tuple[float, float]]:
     """Speed (m/s), its standard deviation and 95 % interval.
 
@@ -416,6 +460,8 @@ def _posterior(
         stand: how the wheelsets stand in bogies.
         bowl: speed by the bowl (m/s), relative standard deviation.
         limits: of speeds (m/s).
+        rough: standard deviation of the places of wheelsets (m); those of a bogie err alike, or
+            against each other, and leave its centre where it is.
     """
     speed = float(np.clip(guess, *limits)) * np.exp(_GRID)
     log = np.where((speed >= limits[0]) & (speed <= limits[1]), 0.0, -np.inf)
@@ -423,7 +469,7 @@ def _posterior(
         length = speed[:, None] * np.array([stand.base, *(stand.centres or ())])
         # those of one build are seen with one error
         measured = np.full(length.shape, 2**0.5 * PLACE_SIGMA)
-        measured[:, 0] = np.hypot(measured[:, 0], stand.scatter * speed)
+        measured[:, 0] = np.hypot(2**0.5 * rough, stand.scatter * speed)
         log += rolling.log_prior(length, measured / length)
     if stand.locomotive:
         log += rolling.log_locomotive(speed * stand.locomotive)
@@ -445,9 +491,9 @@ def alone(shown: Shown) -> Single | None:
     speeds = [] if shown.guess is None else [shown.guess]
     speeds += [float(v) for v in _trials(shown)]
     speeds = [v for v in speeds if v <= shown.top]
-    trials, sure = _deflected(shown, speeds)
-    if not sure:
-        trials += _energetic(shown, speeds[:_ENERGETIC])
+    trials, seen = _deflected(shown, speeds)
+    if not seen:
+        trials += _energetic(shown, speeds)
     if not trials:
         return None
     best, worth = _likeliest(shown, trials)
@@ -459,17 +505,21 @@ def alone(shown: Shown) -> Single | None:
         stand = bogies(fine.times)
         if not _BASES[0] < stand.base * nominal < _BASES[1]:
             stand = Bogies()
-        speed = _posterior(nominal, stand, (nominal, spread), limits)
+        # a bogie of one broad pulse explains little less than its two wheelsets do
+        placed = np.all(fine.time_sigma > 0) and fine.worth(placed=True) > _BEYOND_DOUBT
+        rough = PLACE_SIGMA if best.placed or placed else _MERGED
+        speed = _posterior(nominal, stand, (nominal, spread), limits, rough)
         method = "wheelbase and bowl of the deflection"
     elif best.bogies.clear:
         stand = best.bogies
-        speed = _posterior(stand.speeds()[0], stand, None, limits)
+        rough = PLACE_SIGMA if best.placed else _MERGED
+        speed = _posterior(stand.speeds()[0], stand, None, limits, rough)
         method = "typical wheelbase"
     else:
         return None
     place = float(np.median(best.found.sigma)) * speed[0] / best.speed
     times = best.times if fine is None else fine.times
-    return _result(times, place, speed, best.found, fine, worth, stand, method)
+    return _result(times, place, rough, speed, best.found, fine, worth, stand, method)
 
 
 def _bowl(shown: Shown, best: _Trial) -> Corner | None:
@@ -503,9 +553,53 @@ def _refined(wave: Wave, times: Array, first: float) -> Corner | None:
     return None
 
 
+def accelerated(times: Array, sigma: float, stand: Bogies, speed: float) -> tuple[float, float]:
+    """Acceleration (m/s²) at mid-train, and its standard deviation, by cars of one kind.
+
+    A distance that repeats takes less and less time. With the place s_k of bogie k behind the
+    first of its row, n and m of the longer and shorter distances, its time is
+
+        t_k = t_0 + n T_1 + m T_2 - a / (2 v) (t_k - t_m)²,
+
+    about the middle t_m of the train: least squares of t_0 of every row, T_1, T_2 and a, with the
+    prior of trains that accelerate.
+
+    Args:
+        times: of the wheelsets (s).
+        sigma: of these, usual standard deviation (s).
+        stand: their bogies.
+        speed: at mid-train (m/s).
+    """
+    if stand.centres is None:
+        return 0.0, PRIOR_ACCELERATION
+    groups = np.split(times, 1 + np.flatnonzero(np.diff(times) > _BOGIE * stand.base))
+    at = np.array([group.mean() for group in groups if group.size in (2, 3)])
+    kinds = np.array(stand.centres)
+    alike = np.abs(np.log(np.diff(at)[:, None] / kinds)) < SAME_GAP
+    if np.log(stand.ratio) < SAME_GAP:
+        alike = alike.any(axis=1, keepdims=True)
+    row = np.append(0, np.cumsum(~alike.any(axis=1)))
+    passed = np.concatenate([np.zeros((1, alike.shape[1])), np.cumsum(alike, axis=0)])
+    away = at - 0.5 * (times[0] + times[-1])
+    matrix = np.column_stack([-(away**2) / (2 * speed), passed, row[:, None] == np.unique(row)])
+    # pulled towards the prior, in units of the sigma of a bogie's middle
+    usual = sigma / 2**0.5
+    pull = np.zeros((1, matrix.shape[1]))
+    pull[0, 0] = usual / PRIOR_ACCELERATION
+    both = np.concatenate([matrix, pull])
+    normal = np.linalg.pinv(both.T @ both)
+    fit = normal @ matrix.T @ at
+    rest = at - matrix @ fit
+    free = max(at.size - int(np.linalg.matrix_rank(matrix)), 0)
+    # few of them tell their own scatter badly: the sigma counts like four more
+    variance = (float(rest @ rest) + _LIKE * usual**2) / (free + _LIKE)
+    return float(fit[0]), float(min(np.sqrt(variance * normal[0, 0]), PRIOR_ACCELERATION))
+
+
 def _result(
     times: Array,
     place: float,
+    rough: float,
     speed: tuple[float, float, tuple[float, float]],
     found: Wheelsets,
     fine: Corner | None,
@@ -515,12 +609,14 @@ def _result(
 ) -> Single:
     middle = 0.5 * float(times[0] + times[-1])
     mean, sigma, _ = speed
-    covariance = np.diag([place**2, sigma**2, PRIOR_ACCELERATION**2])
-    motion = Motion(middle, mean * (middle - float(times[0])), mean, 0.0, covariance)
-    if fine is not None and np.all(fine.time_sigma > 0):
+    if fine is not None and np.all(fine.time_sigma > 0) and rough < _MERGED:
         spread = np.hypot(fine.time_sigma, _BOWL_SIGMA / mean)
     else:
-        spread = np.full(times.size, float(np.hypot(place, PLACE_SIGMA)) / mean)
+        spread = np.full(times.size, float(np.hypot(place, rough)) / mean)
+    rate, rate_sigma = accelerated(times, float(np.median(spread)), stand, mean)
+    covariance = np.diag([place**2, sigma**2, rate_sigma**2 + (rate * sigma / mean) ** 2])
+    away = middle - float(times[0])
+    motion = Motion(middle, mean * away - 0.5 * rate * away**2, mean, rate, covariance)
     return Single(
         times=times,
         time_sigma=spread,
