@@ -194,10 +194,12 @@ class ResponsePassage:
                 return False
         chosen = CORRELATED * float(np.log(choices))
         evidence = common.evidence - chosen
+        certain = evidence > CERTAIN_EVIDENCE
         explained = min(model.unexplained for model in common.models) <= USUAL_MISFIT
-        explained |= evidence > CERTAIN_EVIDENCE
+        # wagons are empty or loaded: a known train need not weigh the same everywhere
+        alike = common.alike or (certain and fit.cars is None)
         clear = evidence > CONFIRM_EVIDENCE and common.covariance is not None
-        return clear and explained and common.alike
+        return clear and (explained or certain) and alike
 
     @property
     def unit(self) -> float:

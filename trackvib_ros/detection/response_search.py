@@ -39,7 +39,6 @@ KEPT = 15.0
 _MOST_MISFIT, _LEAST_MISFIT = 0.5, 0.001  # part of the spectrum that no response explains
 _DEVIATIONS = 0.1, 0.3, 1.0  # power of what wheelsets of a car differ by, over the misfit
 _REACHES, _RINGS = (40.0, 20.0, 10.0), (1.0, 0.5, 0.2)  # m before and after a wheelset; s
-_SUPPORTS = (_REACHES[0], _RINGS[0]), (_REACHES[2], _RINGS[1])  # of a first look
 _MIDDLE, FINE = 4.0, 2.0  # m, shortest waves that are compared, later
 _RANGE = (-0.35, 0.40)  # ln of speed about that of the passing time
 _DECELERATION = 0.4  # of the speed, largest change over a passage
@@ -152,7 +151,7 @@ class Search:
             train, reverse: the train.
             bent: whether it may accelerate.
             about: range of the logarithm of its speed, for a train of free proportions: with short
-                waves and short responses some of them look like any burst.
+                waves some of them look like any burst.
         """
         wave = COARSE if about else min(COARSE, train.span / _WAVES)
         expected = PASSED * train.span / self.duration
@@ -167,32 +166,28 @@ class Search:
         )
         places = train.oriented(reverse) - 0.5 * train.span
         prior = -0.5 * (np.log(speeds / expected) / PASSED_SPREAD) ** 2
+        models = self.models(expected, wave, _REACHES[0], _RINGS[0])
+        if not all(model.spectrum.usable for model in models):
+            return []
+        spacing = max(0.5 * _REACHES[0] / expected, 0.02)
+        far = np.ceil(0.15 * self.duration / spacing)
+        centres = np.arange(-far, far + 1) * spacing
         found = []
-        # with a response as long as a short train any motion repeats itself, and one that is too
-        # short explains no long one
-        for reach, ring in _SUPPORTS[:1] if about else _SUPPORTS:
-            models = self.models(expected, wave, reach, ring)
-            if not all(model.spectrum.usable for model in models):
-                continue
-            spacing = max(0.5 * reach / expected, 0.02)
-            far = np.ceil(0.15 * self.duration / spacing)
-            centres = np.arange(-far, far + 1) * spacing
-            for a in bends:
-                bent_all = np.full(speeds.size, a)
-                each = [
-                    m.evidence(m.comb(places, speeds, bent_all), places.size, centres)
-                    for m in models
-                ]
-                total = prior - 0.5 * (a / PRIOR_ACCELERATION) ** 2
-                total = total + sum(e.max(axis=1) for e in each)
-                before, after = np.r_[-np.inf, total[:-1]], np.r_[total[1:], -np.inf]
-                for i in np.flatnonzero((total >= before) & (total >= after)):
-                    placed = tuple(
-                        replace(m, centre=float(centres[np.argmax(e[i])]))
-                        for m, e in zip(models, each, strict=True)
-                    )
-                    v, score = float(speeds[i]), float(total[i])
-                    found.append(ResponseFit(train, reverse, v, float(a), score, placed))
+        for a in bends:
+            each = [
+                m.evidence(m.comb(places, speeds, np.full(speeds.size, a)), places.size, centres)
+                for m in models
+            ]
+            total = prior - 0.5 * (a / PRIOR_ACCELERATION) ** 2
+            total = total + sum(e.max(axis=1) for e in each)
+            before, after = np.r_[-np.inf, total[:-1]], np.r_[total[1:], -np.inf]
+            for i in np.flatnonzero((total >= before) & (total >= after)):
+                placed = tuple(
+                    replace(m, centre=float(centres[np.argmax(e[i])]))
+                    for m, e in zip(models, each, strict=True)
+                )
+                v, score = float(speeds[i]), float(total[i])
+                found.append(ResponseFit(train, reverse, v, float(a), score, placed))
         apart: list[ResponseFit] = []
         for fit in ranked(found):
             near = 2 * _NEIGHBOUR * wave / train.span
