@@ -47,7 +47,7 @@ _SHIFTS = np.arange(-REACH, REACH + 0.01, 0.02)
 _SAMPLES = 2.5  # per wavelength at least
 _BAND = 0.5  # rad/m, of one level of noise
 _LINES = 2.0  # shape of the distribution of its variance; heavy tails, with a mean
-_LEVEL_ROUNDS = 8
+_LEVEL_ROUNDS = 4
 _FINE_STEP = 0.05  # m, for the shortest of these waves
 # rad/m; a wheel does not follow waves shorter than 0.2 m at speed
 _GROUPS = ((1.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0), (25.0, 30.0))

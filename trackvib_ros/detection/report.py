@@ -132,7 +132,7 @@ def truncated(
                 "cars": "unknown",
                 "units": "unknown",
                 "on_record": Estimate(found.distance, part, "m"),
-                "score": round(found.score, 4),
+                "score": round(float(found.score), 4),
                 "catalogue": catalogue.version,
             },
             quality=tuple(flags),
