@@ -414,6 +414,50 @@ def _loggers(s: StandIn) -> None:
     s.marks["clock"] = shift / s.rate
 
 
+def _turnout(s: StandIn) -> None:
+    """Crossings and joints of a turnout within 25 m: each wheelset strikes every one of them.
+
+    Crossing noses make peaks of several times those of plain track and last some ms (Milosevic et
+    al., Sensors 20, 2020, 4176: 100 g and more beside 20 g).
+    """
+    random, shape = s.random, _rail(s.random, s.rate)
+    for at, strength in zip(
+        random.uniform(-25, 25, 3), 10 ** random.uniform(0, 0.7, 3), strict=True
+    ):
+        for c, channel in enumerate(s.channels):
+            fade = 10 ** (-0.4 * abs(at - channel.x) / 20)
+            for offset in s.axles:
+                part, xi = s.part(c, offset + at - s.direction * channel.x, 3.0)
+                own = strength * fade * 10 ** (random.normal(0, 4) / 20)
+                hit = np.where(xi > 0, np.exp(-xi / 0.25), np.exp(xi / 0.02))
+                s.samples[part, c] += own * hit * _shaped(random, xi.size, shape) / _RMS
+
+
+def _charge(s: StandIn) -> None:
+    """A charge amplifier set to structure-borne sound: second order, nothing below 5 to 20 Hz."""
+    sos = signal.butter(2, 10 ** s.random.uniform(0.7, 1.3), "high", fs=s.rate, output="sos")
+    s.samples[:] = signal.sosfilt(sos, s.samples, axis=0)
+
+
+def _sleeper(s: StandIn) -> None:
+    """A sensor on a sleeper: pads pass no more than 150 to 500 Hz, the ballast bends for metres.
+
+    Resonance of a sleeper on its ballast under pads at 100 to 500 Hz (Thompson, Railway Noise and
+    Vibration, 2009, ch. 3); deflection with the characteristic length of 0.9 to 1.4 m of soft
+    ballasted track (Esveld, Modern Railway Track, 2001, ch. 5: L = 0.6 to 1.2 m and more).
+    """
+    top = min(10 ** s.random.uniform(2.2, 2.7), 0.42 * s.rate)
+    low = signal.butter(2, top, "low", fs=s.rate, output="sos")
+    s.samples[:] = signal.sosfilt(low, s.samples, axis=0)
+    length, level = s.random.uniform(0.9, 1.4), 10 ** s.random.uniform(-0.7, 0.2)
+    for c in range(len(s.channels)):
+        for offset in s.axles:
+            part, xi = s.part(c, offset, 10.0)
+            q = np.abs(xi) / length
+            bend = np.exp(-q) * (np.cos(q) - np.sin(q))
+            s.samples[part, c] += level * (s.speed / 60) ** 2 * bend
+
+
 def _none(_: StandIn) -> None:
     return
 
@@ -445,6 +489,9 @@ DISTURBANCES: dict[str, tuple[Callable[[StandIn], None], Callable[[StandIn], Non
     "paced": (_none, _paced),
     "moved": (_none, _moved),
     "loggers": (_none, _loggers),
+    "turnout": (_turnout, _none),
+    "charge": (_none, _charge),
+    "sleeper": (_sleeper, _none),
 }
 """What is added with the train, and what is done to the record after the noise."""
 

@@ -26,9 +26,9 @@ OFTEN = {
     "echo": 0.12, "joint": 0.15, "sleepers": 0.25, "corrugation": 0.1, "round": 0.15, "flats": 0.1,
     "hum": 0.25, "resonant": 0.25, "coupled": 0.4, "clipped": 0.04, "saturated": 0.05, "bits": 0.15,
     "gains": 0.3, "reversed": 0.25, "offset": 0.25, "missing": 0.05, "drops": 0.06, "loggers": 0.05,
-    "moved": 0.25, "jitter": 0.15, "paced": 0.15,
+    "moved": 0.25, "jitter": 0.15, "paced": 0.15, "turnout": 0.1, "sleeper": 0.15, "charge": 0.1,
 }  # fmt: skip
-"""Probabilities of disturbances, in the order of the measuring chain."""
+"""Probabilities of disturbances, in the order of the measuring chain but for the last three."""
 
 
 def many() -> Catalogue:

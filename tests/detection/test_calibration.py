@@ -105,6 +105,12 @@ def test_text_and_back():
     state = Calibration.untaught(CHANNELS, 0.05).learned(measured(0.04))
     again = Calibration.from_json(state.to_json())
     assert again.to_json() == state.to_json()
+    doubted = state.learned(measured(2.0))
+    assert doubted.doubt is not None and not np.allclose(doubted.doubt.offset, state.offset)
+    again, once = (
+        c.learned(measured(2.0)) for c in (Calibration.from_json(doubted.to_json()), doubted)
+    )
+    assert again.to_json() == once.to_json() != doubted.to_json()
     with pytest.raises(InputError, match="offset_m"):
         Calibration.from_json(state.to_json().replace('"offset_m"', '"offset"'))
 

@@ -72,12 +72,18 @@ def test_loggers_whose_clocks_differ_tell_the_type_and_its_speed():
 def test_a_sensor_that_is_elsewhere_does_not_tell_the_speed():
     s = stand_in(SEEDS["figures"] + 41, "none", "roomy", 1000.0, 2, snr_db=25, train="ICE3")
     stated = (s.channels[0], Channel("b", s.channels[1].x + 2.0, "rail"))
-    events = detect(s.rate, s.samples, stated, KNOWN)
+    detector = TrainDetector(stated, KNOWN)
+    data = (s.samples / np.abs(s.samples).max()).astype(np.float32)
+    events = detector.process(Waveform(0, 1_000_000, ("a", "b"), data)) + detector.finish()
     (passage,) = of(events, "passage")
     assert passage.values["type"] == "ICE3"
     speed = passage.values["speed"]
     assert abs(speed.value - s.mid_speed(0.0)) < 3 * speed.sigma < 0.03 * speed.value
     assert {"moved", "unsynchronised"} & set(passage.quality)
+    # whether its clock is off or its place is, later passages tell
+    doubt = detector.calibration.doubt
+    assert doubt is not None
+    assert doubt.offset[1] - doubt.offset[0] == pytest.approx(-2.0, abs=0.1)
 
 
 def test_what_goes_on_beside_a_train_is_told():

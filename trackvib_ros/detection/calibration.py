@@ -71,8 +71,7 @@ class Calibration:
         bowl: ln of the wavenumber k0 (rad/m) of the rail's deflection at every channel
             (:mod:`bowl`), shape (channels,).
         bowl_variance: of it, shape (channels,).
-        doubt: what passages that contradict it say, since the last one that did not. The text of a
-            calibration leaves it out.
+        doubt: what passages that contradict it say, since the last one that did not.
     """
 
     channels: tuple[str, ...]
@@ -253,6 +252,12 @@ class Calibration:
                 "passages": self.passages,
                 "ln_bowl_wavenumber": self.bowl.tolist(),
                 "ln_bowl_variance": self.bowl_variance.tolist(),
+                "doubt": self.doubt
+                and {
+                    "offset_m": self.doubt.offset.tolist(),
+                    "covariance_m2": self.doubt.covariance.tolist(),
+                    "ln_odds": self.doubt.log_odds,
+                },
             }
         )
 
@@ -278,16 +283,15 @@ class Calibration:
             variance = np.array(table["ln_bowl_variance"], dtype=np.float64)
             stated = np.array(table["stated_m"], dtype=np.float64)
             passages = int(table["passages"])
+            doubt = _doubt(table.get("doubt"))
         except (ValueError, KeyError, TypeError) as failure:
             raise InputError(f"calibration: {failure}; give what to_json wrote") from None
         n = len(names)
         if positions.shape != (n,) or not np.isfinite(positions).all():
             raise InputError(f"calibration: positions_m must be {n} finite numbers (m)")
-        if offset.shape != (n,) or covariance.shape != (n, n):
-            raise InputError(
-                f"calibration: offset_m {offset.shape} and covariance_m2 {covariance.shape} must "
-                f"be ({n},) and ({n}, {n}), one per channel"
-            )
+        _check_places("", offset, covariance, n)
+        if doubt is not None:
+            _check_places("doubt: ", doubt.offset, doubt.covariance, n)
         if stated.shape != (n,) or not (np.isfinite(stated).all() and np.all(stated > 0)):
             raise InputError(f"calibration: stated_m must be {n} positive numbers (m)")
         if bowl.shape != (n,) or variance.shape != (n,):
@@ -295,13 +299,31 @@ class Calibration:
                 f"calibration: ln_bowl_wavenumber {bowl.shape} and ln_bowl_variance "
                 f"{variance.shape} must be ({n},), one per channel"
             )
-        if not (np.isfinite(covariance).all() and np.isfinite(offset).all()) or (
-            n and np.linalg.eigvalsh(covariance).min() < -1e-12
-        ):
-            raise InputError("calibration: covariance_m2 must be finite and not negative (m²)")
         if not (np.isfinite(bowl).all() and np.isfinite(variance).all() and np.all(variance > 0)):
             raise InputError("calibration: ln_bowl_variance must be finite and positive (-)")
-        return cls(names, positions, offset, covariance, stated, passages, bowl, variance)
+        return cls(names, positions, offset, covariance, stated, passages, bowl, variance, doubt)
+
+
+def _doubt(table: Mapping[str, Any] | None) -> Doubt | None:
+    if table is None:
+        return None
+    offset, covariance = (
+        np.array(table[name], dtype=np.float64) for name in ("offset_m", "covariance_m2")
+    )
+    return Doubt(offset, covariance, float(table["ln_odds"]))
+
+
+def _check_places(whose: str, offset: Array, covariance: Array, n: int) -> None:
+    """Check offsets (m) of n channels and their covariance (m²)."""
+    if offset.shape != (n,) or covariance.shape != (n, n):
+        raise InputError(
+            f"calibration: {whose}offset_m {offset.shape} and covariance_m2 {covariance.shape} "
+            f"must be ({n},) and ({n}, {n}), one per channel"
+        )
+    if not (np.isfinite(covariance).all() and np.isfinite(offset).all()) or (
+        n and np.linalg.eigvalsh(covariance).min() < -1e-12
+    ):
+        raise InputError(f"calibration: {whose}covariance_m2 must be finite and not negative (m²)")
 
 
 def _log_density(surprise: Array, covariance: Array) -> float:

@@ -80,8 +80,11 @@ def fit_hypotheses(
         delay = _late(fitted[best.candidate].fit, best, candidates[best.candidate].places)
         told = _clock_offset(delay, float(stated[k]) / best.motion.speed, passage.direction)
         told = told[0], float(np.hypot(told[1], 0.2 / best.motion.speed))
+        # a wrong clock is another distance at every speed, a moved sensor is not: more will tell
+        measured = _measure(candidates, names, direction * stated, direction) if direction else None
         return replace(
             passage,
+            measured=measured,
             clock_offset=(*passage.clock_offset, (wrong.trace.name, *told)),
             quality=tuple({*passage.quality, "unsynchronised"}),
         )
