@@ -61,10 +61,19 @@ def test_wheelsets_in_their_places_are_seen_without_contrast():
 
 def test_wheelsets_anywhere_are_not_seen():
     rng = np.random.default_rng(2)
+    strong = 0
     for _ in range(200):
         chance = _passage(rng.uniform(-1.1, 1.1, (2, METRO.axles.size)))
         assert chance._in_place < IN_PLACE / 3
         assert not chance.confirmed
+        # nor where something strong is found in every window
+        loud = replace(chance.hypotheses[0].fit, contrast=np.full((2, METRO.axles.size), 1.3))
+        (best,) = chance.hypotheses
+        chance = replace(chance, hypotheses=(replace(best, fit=loud),))
+        assert chance.confirmed is (chance._in_place >= 0)
+        strong += chance.confirmed
+    # the spread of 48 places is known to a tenth, and the limit is a sixth below that of chance
+    assert strong < 0.1 * 200
 
 
 def test_one_channel_names_no_type_that_is_a_car_longer_than_what_is_strong():
