@@ -8,6 +8,10 @@ neighbours differ, would without a line be independent Gaussian noise, and
 
 exponential with mean 1 (Kay, Fundamentals of Statistical Signal Processing II, 1998, sec. 7.6.2):
 quiet stretches count, those in which a train is loud hardly do.
+
+A stream (:class:`.TrainDetector`, the nodes) keeps its hum: the amplitude under a train is that
+before and after it, so that what is told while it passes would have to wait. There the hum is part
+of the noise floor; where it is as strong as trains, take it out at the sensor.
 """
 
 from __future__ import annotations

@@ -194,8 +194,8 @@ class Passage:
         shown = max(fit.in_phase, self.hypotheses[0].phase if self.unknown < 0.5 else 0.0)
         if shown > IN_PHASE and self.direction != 0:
             return self.score >= (HOPELESS_SCORE if self._in_place > IN_PLACE else IN_STEP_SCORE)
-        if self.direction != 0 and self._in_place < 0:
-            return False
+        if self.direction != 0 and self._in_place + shown < 0:
+            return False  # both are ln of likelihoods, and scores do not outweigh them
         if np.all(seen < np.minimum(LEAST_SEEN, fit.observed.sum(axis=1))) and not (
             self.direction != 0 and self._in_place > IN_PLACE
         ):
