@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from . import travel
 from .bowl import WAVENUMBER, corner
 from .calibration import Calibration
+from .delay import FIRST_SIGMA, KNOWN_START
 from .kinematics import Motion
 from .place import STIFFNESS, Wave, agreement, likelihood, locate
 from .record import Record
 from .single import HUMP, HUMP_FINE, SAME_GAP, Shown, alone, bogies, log_energy
+from .strength import strong_interval
 from .travel import Pair, Travel
 from .wheelsets import Wheelsets, find, heights
 
@@ -264,9 +266,11 @@ def _two_channels(
     both = levels.min(axis=0) > _BOTH * np.abs(levels).max(axis=0)
     start = float(pair.axis(found.motion, found.direction)[0]) + 0.5 * travel.CELL
     motion, places, place_sigma = _placed(a, b, found, start + wheelsets.place)
-    covariance = motion.covariance.copy()
-    covariance[1, 1] += found.doubt**2
-    motion = replace(motion, covariance=covariance)
+    sure = 1.0
+    if not _in_order(pair, a.window.bands[found.band], found):
+        covariance = motion.covariance.copy()
+        covariance[1, 1] += found.doubt**2
+        motion, sure = replace(motion, covariance=covariance), found.sure
     times = motion.time_at(places)
     motion = _bent(a, b, motion, found.direction, places)
     places = motion.distance_at(times)
@@ -283,8 +287,8 @@ def _two_channels(
         time_sigma=np.sqrt(wheelsets.sigma**2 + place_sigma**2 + _SHAPE**2)
         / motion.speed_at(times),
         # bogies further apart than wheelsets are: one pulse for both wheelsets of a bogie
-        regular=min(wheelsets.certainty, found.sure, 1.0 if paired.mean() > _PAIRED else 0.5),
-        direction=found.direction if found.sure > _WAY else 0,
+        regular=min(wheelsets.certainty, sure, 1.0 if paired.mean() > _PAIRED else 0.5),
+        direction=found.direction if sure > _WAY else 0,
         correlation=found.correlation[1],
         travels=_is_train(wheelsets.place[both], paired[both]),
         method="delay between two rail channels",
@@ -292,6 +296,19 @@ def _two_channels(
         spacing_sigma=float(np.hypot(2**0.5 * np.median(wheelsets.sigma), 2 * _SHAPE)),
         baseline=b.channel.x - a.channel.x,
     )
+
+
+def _in_order(pair: Pair, band: tuple[float, float], found: Travel) -> bool:
+    """Whether a train reaches both channels on record, one after the other as a motion says."""
+    starts = []
+    for traces in pair.traces:
+        trace = traces[found.band]
+        strong = strong_interval(trace, band[1] - band[0], pair.within)
+        if strong is None or strong[0] < max(pair.within[0], float(trace.time[0])) + KNOWN_START:
+            return False
+        starts.append(strong[0])
+    late = starts[1] - starts[0] - found.direction * pair.baseline / found.motion.speed
+    return abs(late) * found.motion.speed < 2 * FIRST_SIGMA
 
 
 def _placed(a: Record, b: Record, found: Travel, places: Array) -> tuple[Motion, Array, float]:

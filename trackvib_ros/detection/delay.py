@@ -62,9 +62,11 @@ _CORRELATED = 6.0  # m, of what channels do not share: three of the longest wave
 _NEAR = 1.0  # m about a delay: beyond, another wheelset is taken for this one
 _EVIDENCE = 1e4  # likelihood ratio to chance at which a delay is told
 _TRAVELS = 19.0  # the same to what comes at once: 95 %
-_FIRST_SIGMA = 2.5  # m, where a channel becomes strong: at the first wheelset or the next one
+FIRST_SIGMA = 2.5
+"""Where a channel becomes strong (m): at the first wheelset or the next one."""
 _LATE = 0.1  # probability that one does so at some later time
-_KNOWN_START = 0.1  # s after the start of the record: what is strong before may have been so
+KNOWN_START = 0.1
+"""Time after the start of a record (s), before which what is strong may have been so."""
 
 
 @dataclass(frozen=True)
@@ -441,7 +443,7 @@ def _order(
 ) -> Array:
     """ln of the likelihood of the delays by when the channels become strong, shape (delays,)."""
     delays = np.array([item.delay for item in likely])
-    sigma = _FIRST_SIGMA / np.array([item.speed for item in likely])
+    sigma = FIRST_SIGMA / np.array([item.speed for item in likely])
     late = _LATE / (2 * (within[1] - within[0]))
     told = []
     for band, pair in traces.items():
@@ -450,7 +452,7 @@ def _order(
             low, high = record.window.bands[band]
             found = strong_interval(trace, high - low, within)
             own = max(within[0], float(trace.time[trace.valid][0]))
-            if found is not None and found[0] > own + _KNOWN_START:
+            if found is not None and found[0] > own + KNOWN_START:
                 starts.append(found[0])
         if len(starts) == 2:
             z = (starts[1] - starts[0] - delays) / sigma
