@@ -11,6 +11,7 @@ from trackvib_ros.detection import CONFIRMED, Catalogue, detect
 from trackvib_ros.detection.blind import Blind
 from trackvib_ros.detection.bowl import _LOADS, _STRENGTHS, _odds, corner, low_pass
 from trackvib_ros.detection.kinematics import PRIOR_ACCELERATION, Motion
+from trackvib_ros.detection.passage import _SCATTER, UNLIKE
 from trackvib_ros.detection.place import Wave
 from trackvib_ros.detection.single import Shown, _likeliest, _Trial, accelerated, bogies
 from trackvib_ros.detection.wheelsets import Wheelsets
@@ -198,3 +199,9 @@ def test_cars_of_one_kind_tell_the_acceleration(wheelsets):
     assert np.median(sigmas) < (0.03 if wheelsets > 10 else 0.3)
     # what has no cars tells nothing
     assert accelerated(times[:6], 1e-3, bogies(times[:6]), middle) == (0.0, PRIOR_ACCELERATION)
+
+
+def test_scatter_that_is_as_likely_of_an_unlisted_train():
+    at = np.log(UNLIKE)
+    listed, other = (p / s * np.exp(-0.5 * ((at - m) / s) ** 2) for m, s, p in _SCATTER)
+    assert listed == pytest.approx(other, rel=0.03)

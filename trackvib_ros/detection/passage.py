@@ -32,7 +32,7 @@ left."""
 SCATTERED_SCORE = 0.70
 """Least pattern correlation at which a type is named by the pattern of one channel alone."""
 
-UNLIKE = 0.33
+UNLIKE = 0.26
 """Scatter (m) from which on it is likelier that of an unlisted train about the nearest type: ln of
 that of listed trains on one channel is -3.4 ± 0.9 (computed passages of 0 to 40 dB), of unlisted
 ones -1.0 ± 0.5, and these are one in twenty."""

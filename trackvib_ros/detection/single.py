@@ -508,6 +508,8 @@ def alone(shown: Shown) -> Single | None:
         # a bogie of one broad pulse explains little less than its two wheelsets do
         placed = np.all(fine.time_sigma > 0) and fine.worth(placed=True) > _BEYOND_DOUBT
         rough = PLACE_SIGMA if best.placed or placed else _MERGED
+        if rough == _MERGED:  # bowls about wrong places are as wide as these are wrong
+            spread = float(np.hypot(spread, 0.5 * shown.bowl[0] * _MERGED))
         speed = _posterior(nominal, stand, (nominal, spread), limits, rough)
         method = "wheelbase and bowl of the deflection"
     elif best.bogies.clear:
