@@ -83,8 +83,9 @@ def _followed(
     weight = 1 / np.maximum(noise, 1e-12 * float(np.mean(np.abs(amplitude) ** 2)) + 1e-300)
     length = time.size * float(time[1])
     most = min(max(1, int(np.ceil(4 * _OFF * line * length))), 2 * time.size)
-    offs = np.arange(-most, most + 1) / (4 * length)
-    gain = [abs(np.sum(weight * amplitude * np.exp(-2j * np.pi * off * time))) for off in offs]
+    quarters = np.arange(-most, most + 1)
+    offs = quarters / (4 * length)
+    gain = np.abs(fft.fft(weight * amplitude, 4 * time.size)[quarters])
     best = int(np.argmax(gain))
     if gain[best] ** 2 < _LEAST * float(weight.sum()):
         return None
