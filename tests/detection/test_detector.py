@@ -266,12 +266,12 @@ def test_a_train_is_told_before_the_next_one_has_passed(kmh, gap):
 
 
 @pytest.mark.parametrize("kind", NUISANCES)
-def test_no_nuisance_is_a_train(kind):
+def test_no_nuisance_is_a_train_nor_has_a_provisional_speed(kind):
     for seed in range(2):
         rng = np.random.default_rng([seed, NUISANCES.index(kind)])
         x = 10 ** rng.uniform(0.3, 2) * nuisance(kind, 10, 2000, rng)
         events = detect(2000.0, x + rng.standard_normal(x.size), RAILS[0])
-        assert not passages(events)
+        assert not passages(events) and not of(events, "update")
 
 
 def test_noise_alone_is_silent():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from solver import load_scenario_text
-from tests.detection.synthetic import CATALOGUE, NUISANCES, RAILS, Passage, nuisance, record
+from tests.detection.synthetic import CATALOGUE, RAILS, Passage, record
 from trackvib_ros.bag import BagReader
 from trackvib_ros.detection import CONFIRMED, VIBRATION, Channel, detect, detector
 from trackvib_ros.detection.closing import Closing
@@ -47,13 +47,6 @@ def test_one_rail_tells_a_speed_while_the_train_passes(name, kmh, snr, kind):
         assert 0.97 < sum(types.values()) < 1.001  # those below one in a thousand are left out
         assert types[name] > 0.01
     assert update.values["passed"].value > 12 * 2.5  # twelve wheelsets, 2.5 m apart or more
-
-
-@pytest.mark.parametrize("kind", NUISANCES)
-def test_no_nuisance_has_a_provisional_speed_on_one_rail(kind):
-    rng = np.random.default_rng([5, NUISANCES.index(kind)])
-    x = 30 * nuisance(kind, 20, RATE, rng) + rng.standard_normal(20 * RATE)
-    assert not of(detect(RATE, x, RAILS[0]), "update")
 
 
 def demo_rails():

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import solveh_banded
 
 Array = NDArray[np.float64]
 
@@ -63,28 +65,44 @@ class Wheelsets:
     pulse: Array
 
 
-def _shifted(pulse: Array, places: Array, n: int) -> Array:
-    """The pulse at every place (cells), shape (n, places)."""
+def _shifted(pulse: Array, places: Array, n: int) -> sparse.csc_array:
+    """The pulse at every place (cells), shape (n, places); columns of cells beside it are empty."""
     half = pulse.size // 2
-    grid = np.arange(n)[:, None] - places[None, :]
-    out = np.interp(grid, np.arange(-half, half + 1), pulse, left=0.0, right=0.0)
-    return np.asarray(out, dtype=np.float64)
+    first = np.ceil(places - half).astype(np.int64)
+    grid = first[:, None] + np.arange(pulse.size)
+    value = np.interp(grid - places[:, None], np.arange(-half, half + 1), pulse, 0.0, 0.0)
+    column = np.broadcast_to(np.arange(places.size)[:, None], grid.shape)
+    use = (grid >= 0) & (grid < n)
+    entries = (value[use], (grid[use], column[use]))
+    return sparse.csc_array(entries, shape=(n, places.size))
+
+
+def _solved(columns: sparse.csc_array, y: Array, ridge: float) -> Array:
+    """Least squares of columns of which only neighbours overlap: banded normal equations."""
+    normal = sparse.coo_array(columns.T @ columns)
+    width = int(np.max(np.abs(normal.row - normal.col), initial=0))
+    upper = normal.row <= normal.col
+    row, column = normal.row[upper], normal.col[upper]
+    band = np.zeros((width + 1, normal.shape[0]))
+    band[width + row - column, column] = normal.data[upper]
+    band[width] += ridge
+    return np.asarray(solveh_banded(band, columns.T @ y, check_finite=False))
 
 
 def _fitted(y: Array, pulse: Array, places: Array) -> tuple[Array, Array, Array]:
     """Places, heights and rest after least squares in both."""
     slope = np.gradient(pulse)
+    ridge = 1e-6 * float(pulse @ pulse)
+    pairs = np.arange(2 * places.size).reshape(2, -1).T.ravel()  # height and move side by side
     for _ in range(4):
         a = _shifted(pulse, places, y.size)
         d = _shifted(slope, places, y.size)
-        both = np.concatenate([a, -d], axis=1)
-        normal = both.T @ both + 1e-6 * float(pulse @ pulse) * np.eye(2 * places.size)
-        x = np.linalg.solve(normal, both.T @ y)
-        q, move = x[: places.size], x[places.size :]
+        both = sparse.csc_array(sparse.hstack([a, -d])[:, pairs])
+        q, move = _solved(both, y, ridge).reshape(-1, 2).T
         shift = np.where(q > 0, move / np.maximum(q, 1e-12), 0.0)
         places = places + np.clip(shift, -1.0, 1.0)
     a = _shifted(pulse, places, y.size)
-    q = np.asarray(np.linalg.lstsq(a, y, rcond=None)[0], dtype=np.float64)
+    q = _solved(a, y, ridge)
     return places, q, np.asarray(y - a @ q)
 
 
@@ -177,8 +195,8 @@ class _Chain:
             while True:
                 before = self._steps(total, k)[:, :, level].ravel() if k else np.zeros(0)
                 options = np.append(before, self.start)
-                weight = np.exp(options - options.max())
-                chosen = int(rng.choice(options.size, p=weight / weight.sum()))
+                share = np.cumsum(np.exp(options - options.max()))
+                chosen = int(np.searchsorted(share, rng.random() * share[-1], side="right"))
                 if chosen == before.size:
                     break
                 k, level = k - (chosen // levels + 1), chosen % levels
@@ -330,4 +348,4 @@ def find(y: Array, noise: Array | None, pulse: Array) -> Wheelsets | None:
 def heights(y: Array, found: Wheelsets) -> Array:
     """Heights of the pulses of wheelsets that were found, in another signal over the same axis."""
     a = _shifted(found.pulse, found.place / CELL, y.size)
-    return np.asarray(np.linalg.lstsq(a, y, rcond=None)[0])
+    return _solved(a, y, 1e-6 * float(found.pulse @ found.pulse))
