@@ -5,7 +5,8 @@ import pytest
 
 from tests.detection.synthetic import RAILS, Passage, record
 from trackvib_ros.detection import CONFIRMED, Catalogue, detect
-from trackvib_ros.detection.blind import _is_train
+from trackvib_ros.detection.blind import Blind, _is_train, _wary
+from trackvib_ros.detection.kinematics import Motion
 from trackvib_ros.detection.pattern import Trace
 from trackvib_ros.detection.travel import BROAD, CELL, FINE, Pair, Series, band_pass, search
 from trackvib_ros.detection.wheelsets import find
@@ -198,3 +199,27 @@ def test_the_blows_of_a_flat_wheel_are_no_bogies():
     for places, train in ((blows, False), (bogies, True)):
         near = np.diff(places) < 3.6
         assert _is_train(places, np.append(near, False) | np.append(False, near)) is train
+
+
+def test_what_goes_on_longer_beyond_wheelsets_than_they_last_is_no_train():
+    """Ten seconds of a vehicle on a road, of which four look like wheelsets in bogies."""
+    places = np.array([0.0, 2.5, 17.5, 20.0, 25.0, 27.5, 42.5, 45.0])
+    motion = Motion(0.0, 0.0, 11.0, 0.0, np.eye(3))
+    blind = Blind(
+        sensors=("a", "b"),
+        x=0.0,
+        motion=motion,
+        speed=(11.0, 0.1),
+        times=motion.time_at(places),
+        time_sigma=np.full(places.size, 0.002),
+        regular=0.9,
+        direction=1,
+        correlation=0.6,
+        travels=True,
+        method="",
+        axle_method="",
+    )
+    first, last = blind.times[[0, -1]]
+    for beyond, train in ((0.0, True), (2.0, True), (6.0, False)):
+        assert _wary(blind, (first, last + beyond)).travels is train
+        assert _wary(blind, (first - beyond, last)).travels is train

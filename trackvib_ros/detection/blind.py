@@ -194,7 +194,8 @@ def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
 
     Strong energy that no wheelset explains is one that was missed, if it lasts for longer than the
     longest gap of the train. Where the number of wheelsets is in doubt, that which the rail carries
-    is one too, one beyond the strong energy may be none, and a whole gap may be missing.
+    is one too, one beyond the strong energy may be none, and a whole gap may be missing. What may
+    go on for longer beyond its wheelsets than they last is no train.
     """
     longest = float(np.max(np.diff(blind.times)))
     sure = blind.regular >= CONFIDENT
@@ -206,7 +207,8 @@ def _wary(blind: Blind, interval: tuple[float, float]) -> Blind:
     ):
         off = abs(missed) if not sure or missed > longest else 0.0
         sigma[k] = np.sqrt(sigma[k] ** 2 + off**2 + doubt**2)
-    return replace(blind, time_sigma=sigma)
+    located = float(np.max(sigma)) < float(blind.times[-1] - blind.times[0])
+    return replace(blind, time_sigma=sigma, travels=blind.travels and located)
 
 
 def _signals(pair: Pair, found: Travel) -> list[tuple[Array, Array, Array]]:
