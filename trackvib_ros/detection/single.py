@@ -423,11 +423,16 @@ def bogies(times: Array) -> Bogies:
     return replace(best, **_between(times, best.base)) if best.base else best
 
 
+def _middles(times: Array, base: float) -> Array:
+    """Middles of the bogies of a wheelbase (s), two or three wheelsets each."""
+    groups = np.split(times, 1 + np.flatnonzero(np.diff(times) > _BOGIE * base))
+    return np.array([group.mean() for group in groups if group.size in (2, 3)])
+
+
 def _between(times: Array, base: float) -> dict[str, Any]:
     """What repeats between bogies of a wheelbase (s), and the gap of pairs that are no bogies."""
     gaps = np.diff(times)
-    groups = np.split(times, 1 + np.flatnonzero(gaps > _BOGIE * base))
-    ways = np.diff([group.mean() for group in groups if group.size in (2, 3)])
+    ways = np.diff(_middles(times, base))
     two = np.sort(np.stack([ways[1:], ways[:-1]], axis=1), axis=1)[:, ::-1]
     out: dict[str, Any] = {}
     if len(two):
@@ -574,8 +579,7 @@ def accelerated(times: Array, sigma: float, stand: Bogies, speed: float) -> tupl
     """
     if stand.centres is None:
         return 0.0, PRIOR_ACCELERATION
-    groups = np.split(times, 1 + np.flatnonzero(np.diff(times) > _BOGIE * stand.base))
-    at = np.array([group.mean() for group in groups if group.size in (2, 3)])
+    at = _middles(times, stand.base)
     kinds = np.array(stand.centres)
     alike = np.abs(np.log(np.diff(at)[:, None] / kinds)) < SAME_GAP
     if np.log(stand.ratio) < SAME_GAP:
